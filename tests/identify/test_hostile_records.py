@@ -61,7 +61,7 @@ def test_steps_of_a_converter_and_exact_limits_of_a_simulation_are_not_clipping(
     coarse = np.round(Y / 0.02) * 0.02
     for values in (Y, coarse, np.clip(coarse, -0.5, 0.5), np.minimum(TRIANGLE, 0.8), STEP):
         assert clipping_of(values, "outputs") == ""
-    # one value in 20 of the noise itself is cut, too few for 2 % of the values
+    # One value in 100 of the noise itself is cut: fewer than 2 %, and rarely three in a row.
     assert clipping_of(np.minimum(NOISE, np.quantile(NOISE, 0.99)), "outputs") == ""
 
 

@@ -92,7 +92,7 @@ def test_a_lost_deadline_names_the_part_that_took_most_of_the_time() -> None:
         assert wall.tick(0.013) == ""
     wall.deadlines.spent("The step of controller 'slow'", 0.0)
     fault = wall.tick(0.013)
-    assert "The step of controller 'slow' took up to 12.0 ms of this time. Make it faster" in fault
+    assert "The step of controller 'slow' took up to 12.0 ms of this delay. Make it faster" in fault
 
 
 def test_a_quick_part_is_not_blamed_for_a_late_computer() -> None:

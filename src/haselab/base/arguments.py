@@ -37,7 +37,7 @@ def checked(function: Callable[Given, Answer]) -> Callable[Given, Answer]:
     Returns:
         The function, which raises `InputError` instead of whatever such a value led to.
     Raises:
-        TypeError: by the function: an argument that it does not have, or one that is missing.
+        TypeError: by the function, for an unknown argument or a missing one.
     Example:
         >>> @checked
         ... def halved(length_m: float) -> float:
@@ -57,7 +57,7 @@ def checked(function: Callable[Given, Answer]) -> Callable[Given, Answer]:
         except TypeError as error:
             # Perhaps arrays where a record is needed, which is the better reason.
             _check_all(dict(zip(signature.parameters, args, strict=False)), kinds)
-            known = ", ".join(signature.parameters)
+            known = ", ".join(name for name in signature.parameters if name != "self")
             raise TypeError(
                 f"{function.__qualname__}() {error}. Its arguments are {known}."
             ) from None

@@ -13,7 +13,7 @@ class SignalExit(SystemExit):
 
 
 class TooLongError(BaseException):
-    """A call took longer than its limit. It is no `Exception`, so that few handlers swallow it."""
+    """A call took longer than its limit. Not an `Exception`, so that few handlers catch it."""
 
 
 @contextlib.contextmanager

@@ -27,9 +27,10 @@ class BandCheck:
     r"""Errors of a prediction over the standard deviation that its band states.
 
     A share $\rho$ of the variance of the band is the uncertainty of the parameters, whose error
-    may be the same in all samples; the rest is noise. The errors are too large for the band if
-    $\overline{z^2} > (1-\rho)\,2^2 + \rho\,3.5^2$. For noise of which only 8 samples are
-    independent, $\overline{z^2} > 2^2$ has a probability of 1e-4.
+    may be the same in all samples; the rest is noise. The errors $z$ are too large for the band if
+    $\overline{z^2} - w^2 > (1-\rho)\,2^2 + \rho\,3.5^2$, where $w$ is the white part of their rms.
+    For noise of which only 8 samples are independent, $\overline{z^2} > 2^2$ has a probability of
+    1e-4.
 
     Args:
         errors: measured minus predicted, over the standard deviation. Shape `(M_r,)` each.
@@ -68,7 +69,7 @@ class BandCheck:
 
     @property
     def noise_rms(self) -> float:
-        """The part of it that is white noise, from second differences."""
+        """The part of `rms` that is white noise, from second differences."""
         second = [np.diff(e, 2) for e in self.errors if e.size > 2]
         found = float(np.sqrt(np.mean(np.concatenate(second) ** 2) / 6.0)) if second else 0.0
         return min(found, self.rms)
@@ -82,17 +83,18 @@ class BandCheck:
             return ""
         return (
             f"model error: the rms error is {self.rms:.3g} times the standard deviation that the "
-            f"95 % band states, and only {100.0 * self.inside:.2g} % of the samples are inside. "
+            f"95 % band states, and only {100.0 * self.inside:.4g} % of the samples are inside. "
             "The model does not describe this record: check that actuator, operating point, units "
             "and sensors are those of the fit, or fit a model to such records too"
         )
 
     @property
     def note(self) -> str:
-        """What is to be said if fewer samples are inside the band than chance explains."""
+        """Sentences if fewer samples are inside the band than chance explains; else empty."""
         from scipy.stats import binom  # slow to import
 
-        # the correlation of being inside counts: an error that all samples share hides in the noise
+        # The correlation of the errors themselves would be that of the noise, which hides an error
+        # that all samples share.
         inside = [(np.abs(e) <= Z95).astype(np.float64) for e in self.errors]
         independent = round(effective_count([part - self.inside for part in inside]))
         if self.inside * independent >= binom.ppf(_BY_CHANCE, independent, _INSIDE):

@@ -12,8 +12,8 @@ __all__ = ["clipping_of"]
 Floats = NDArray[np.float64]
 _FEWEST, _SHARE = 10, 0.02  # least number and share of values at an end of the range
 _RUN = 3  # equal values in a row
-_REPEATS = 0.02  # share of the other values that repeat the one before; above, they are quantised
-_VISIBLE = 1e-5  # noise over the range of the values; below, a simulation may have an exact limit
+_REPEATS = 0.02  # share of the other values that repeat the one before; above it: quantised
+_VISIBLE = 1e-5  # noise over the range of the values; below it, a simulation with an exact limit
 _ORDERS = range(1, 9)  # of differences, which suppress the signal and leave the noise
 _MEDIAN = 0.6745  # of the size of a normal variable, over its standard deviation
 
@@ -23,7 +23,7 @@ def clipping_of(values: ArrayLike, what: str) -> str:
 
     Args:
         values: measured, in order of time. Shape `(N,)`.
-        what: their name, for the message.
+        what: plural name of the values, for the message.
     Returns:
         The reason and what to do, without a full stop; empty if they are not clipped.
     Example:

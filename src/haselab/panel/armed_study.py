@@ -1,4 +1,4 @@
-"""The study that a page has armed the bench for: it is played, and ended when it must end."""
+"""Play the study that a page has armed the bench for, and end it when it must end."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ __all__ = ["CHECK", "ArmedStudy"]
 
 CHECK = "Check the instruments, then arm the bench again."
 _CATCH_UP_S, _WATCH_S = 0.2, 0.1
-_COMPUTES_S = 0.5  # without a block, after which a study does not look whether it must end
+_COMPUTES_S = 0.5  # without a block: the study computes and does not check whether it must end
 
 
 class ArmedStudy:
@@ -95,14 +95,14 @@ class ArmedStudy:
         return reason
 
     def _watch(self, over: threading.Event) -> None:
-        """End a study that must end while no block is read: it computes, with its last output."""
+        """Trip the bench if the study must end while it computes: the last output is still on."""
         while not over.wait(_WATCH_S):
             idle = time.monotonic() > self._block_s + _COMPUTES_S
             if idle and self._rig.safety.live and (reason := self.why_not()):
                 self._rig.safety.trip(reason)
 
     def why_not(self) -> str:
-        """Why the study must end; empty while it may go on."""
+        """Say why the study must end; empty while it may go on."""
         if not self._end and self._leases.is_lost(self._page):
             time.sleep(_CATCH_UP_S)  # a long calculation may have kept the messages waiting
         if not self._end and self._leases.is_lost(self._page):
@@ -113,5 +113,5 @@ class ArmedStudy:
 
 
 def _unwritable(error: OSError, folder: Path) -> str:
-    """Why a disk or a folder that has gone ends a study."""
+    """Say that the recording cannot be written, why, and where."""
     return f"The recording cannot be written ({error.strerror}). Check the folder. {folder}"

@@ -15,10 +15,10 @@ __all__ = ["CallLimit"]
 class CallLimit:
     """A context in which one call may take a limited time; then it raises `TooLongError` there.
 
-    A signal of the timer interrupts waits and loops in Python, again after each further limit. It
-    cannot interrupt compiled code that never returns to Python. Only the main thread gets signals,
-    and Windows has no such timer: elsewhere, and if the program uses the timer itself, there is no
-    limit.
+    A timer's signal interrupts waits and loops in Python. If the code catches the error and goes
+    on, the timer interrupts it again, each time after `limit_s`. Compiled code that never returns to
+    Python cannot be interrupted. There is no limit in threads other than the main one, which alone
+    gets signals, on Windows, which has no such timer, and in a program that uses the timer itself.
 
     Args:
         limit_s: longest time, in s; None: there is no limit.
@@ -26,12 +26,12 @@ class CallLimit:
 
     def __init__(self, limit_s: float | None) -> None:
         self._limit_s = limit_s
-        self._former: Any = None
+        self._previous: Any = None
         self._running = False
 
     def __enter__(self) -> Self:
         if self._limit_s is not None and _is_free():
-            self._former = signal.signal(signal.SIGALRM, self._rang)
+            self._previous = signal.signal(signal.SIGALRM, self._expired)
             self._running = True
             signal.setitimer(signal.ITIMER_REAL, self._limit_s, self._limit_s)
         return self
@@ -45,10 +45,10 @@ class CallLimit:
         if self._running:
             signal.setitimer(signal.ITIMER_REAL, 0.0)
             self._running = False
-            signal.signal(signal.SIGALRM, self._former)
+            signal.signal(signal.SIGALRM, self._previous)
 
-    def _rang(self, number: int, frame: FrameType | None) -> None:
-        if frame is None or frame.f_code not in _OWN:  # there the timer would stay on
+    def _expired(self, number: int, frame: FrameType | None) -> None:
+        if frame is None or frame.f_code not in _OWN:  # raised there, the timer would stay on
             raise TooLongError(f"it took longer than {self._limit_s:g} s")
 
 

@@ -198,7 +198,7 @@ class CameraRecorder:
     def _place(self, images: NDArray[np.uint8]) -> None:
         """Find the fiducials; in the session's first frames, also make them the reference."""
         if self._tracker is None:
-            rest = images[: self._still(images[:_REST_FRAMES])]
+            rest = images[: self._frames_at_rest(images[:_REST_FRAMES])]
             points = self._call(_fiducials_of, rest)
             self._tracker = PointTracker(points, _OPTIONS)
             self._state = self._tracker.init(list(rest))
@@ -212,8 +212,8 @@ class CameraRecorder:
             self._particles.refer(images[:_REST_FRAMES], points)
             write_png(self._folder / f"{self._name}.png", images[0])
 
-    def _still(self, images: NDArray[np.uint8]) -> int:
-        """Number of frames before the first motion: their mean must not be blurred."""
+    def _frames_at_rest(self, images: NDArray[np.uint8]) -> int:
+        """Number of frames before the first motion, which would blur their mean."""
         try:
             points = self._call(_fiducials_of, images[:1])
         except ResultError:  # too noisy; the mean of all frames may be good enough

@@ -57,7 +57,7 @@ class ClosedLoop:
         block_s = rig.description.block_s
         setting = setting_on_rig(rig.description, carrier[0], loop)
         limits_s: tuple[float | None, float | None] = (None, None)
-        if (settings := rig.safety.settings).real_time:  # where the guardians would act anyway
+        if (settings := rig.safety.settings).real_time:  # the guardians act after the same times
             limits_s = settings.idle_s, settings.lease_s
         self._controller = RunningController(loop.controller, setting, *limits_s)
         self._step_name = f"The step of controller {loop.controller.kind.name!r}"

@@ -59,13 +59,13 @@ class Findings:
         Args:
             where: one sentence on where the other results are.
         Raises:
-            ResultError: with its reason, and how many others failed for another one.
+            ResultError: with the first reason, and the number of the other reasons.
         """
         if not self.failed:
             return
         first, *others = self.failed
         first = first if first.endswith((".", "?", "!")) else f"{first}."
-        more = f" Without a result for another reason: {len(others)} more." if others else ""
+        more = f" Failures for another reason: {len(others)} more." if others else ""
         raise ResultError(f"{first}{more}{f' {where}' if where else ''}")
 
 
@@ -84,6 +84,9 @@ def play_and_fit(
     With a runner each experiment is played before it is fitted; without one, the source already has
     all of them. The fits are the same in both cases.
 
+    If an experiment fails, its results and those that need it are missing. If it fails while the
+    study is played, the rest of the study is not played.
+
     Args:
         source: observations by the experiment's name.
         study: what is played and fitted.
@@ -95,9 +98,6 @@ def play_and_fit(
         known: values of an actuator file that no experiment of the study finds.
     Returns:
         All results.
-    An experiment that fails costs its own results and those that need it. If this happens while
-    the study is played, the rest of the study is not played.
-
     Raises:
         InputError: an experiment is missing from the source.
     """

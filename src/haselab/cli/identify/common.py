@@ -60,7 +60,7 @@ RATE = shared_option("--rate-hz", type=REAL, detail="Default: the rate in the fi
 INPUT = shared_option("--input", "source", default="u", show_default=True)
 OUTPUT = shared_option("--output", default="y", show_default=True)
 
-_COPY = 0.9  # share of the samples of a record above which it is a copy of another one
+_COPY = 0.9  # share of the samples of a record, above which it is a copy of another one
 
 STRETCH = Quantity("--stretch", ("stretch",), "1", "the stretch")
 STRAIN = Quantity("--strain", ("strain",), "1", "the strain")
@@ -145,7 +145,7 @@ def refuse_copies(files: Sequence[Path], outputs: Sequence[NDArray[np.float64]])
         )
     click.echo(
         f"haselab: warning: {text} These count twice, so the intervals are too narrow. Leave out "
-        "the part that both have, or give a twin another seed",
+        "the part that both have. On a twin, record with another seed.",
         err=True,
     )
 

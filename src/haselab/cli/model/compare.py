@@ -129,8 +129,8 @@ def command(
     recognised by their values, also in a part of a record, in another format and with fewer digits.
     Their share is used_for_fit; it is null if the steps of the converter hide whether the record is
     a copy or a repetition. The exit code is 3 if this share is above 5 %, if the prediction is
-    worse than the mean of the record, if its rms error is more than twice that which the band
-    states, or if the record is explained as well without its input.
+    worse than the mean of the record, if its rms error is more than twice the standard deviation
+    that the band states, or if the record is explained as well without its input.
     """
     linear = at_rest or through_voltage_map or held_at_hz is not None
     linear |= hold is not None

@@ -96,7 +96,7 @@ class NoiseFreeRun:
             lines = self._errors.read().decode(errors="replace").strip().splitlines()
             last = lines[-1] if lines else f"exit code {self._process.returncode}"
             raise ResultError(f"The process of the noise-free run ended early: {last}.") from None
-        if isinstance(found, HaselabError):  # whatever it is: the study keeps its own results
+        if isinstance(found, HaselabError):  # of any kind: only the reference values are missing
             raise ResultError(str(found))
         return found  # type: ignore[no-any-return]
 

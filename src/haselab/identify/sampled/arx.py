@@ -46,7 +46,7 @@ _SEARCH_DELAY = 12
 _WHITE = 0.05
 _COLOURED = 1e-3  # whiteness below which a difference from unbiased coefficients counts
 _BIASED = 1.5  # times the error of a simulation with unbiased coefficients: no result
-_RESPONDS = 0.01  # probability above which an output does not depend on its input
+_RESPONDS = 0.01  # p-value above which a response of the output to the input is not shown
 _CONSTANT = 2.5  # standard deviations of a constant that is part of the equation
 _UNKNOWN = (-math.inf, math.inf)
 

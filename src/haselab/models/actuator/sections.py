@@ -230,7 +230,7 @@ class DriveSection(_Section):
 
 
 def _covariance_fault(matrix: NDArray[np.float64]) -> str:
-    """What a matrix has that no covariance can have; empty if there is nothing.
+    """Say why a matrix is not a covariance; empty if it may be one.
 
     The variance of a parameter that is not identifiable may be infinite.
     """
@@ -272,8 +272,8 @@ class PhysicalCovariance(_Section):
         matrix = np.array(self.matrix, dtype=np.float64).reshape(len(sizes), len(sizes))
         if fault := _covariance_fault(matrix):
             raise ValueError(
-                f"the matrix {fault}, so it is no covariance. Restore it, or identify the actuator "
-                "again"
+                f"the matrix {fault}, so it is not a covariance. Restore it, or identify the "
+                "actuator again"
             )
         return self
 

@@ -145,7 +145,7 @@ def identified_twin(path: Path, bench: TwinConfig, draw: int | None = None) -> T
     if not mass_kg < HIGHEST_LOAD_KG:
         raise InputError(
             f"mass_kg is {mass_kg:g} kg, but a twin carries less than {HIGHEST_LOAD_KG:g} kg. "
-            f"Correct it. {path}"
+            f"Lower mass_kg. {path}"
         )
     if not abs(monitor) < HIGHEST_GAIN_ERROR:
         raise InputError(

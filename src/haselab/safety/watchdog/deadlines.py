@@ -134,7 +134,7 @@ class Deadlines:
         by, took_s = self._slow
         if by:
             return (
-                f"{by} took up to {1e3 * took_s:.1f} ms of this time. Make it faster, or raise "
+                f"{by} took up to {1e3 * took_s:.1f} ms of this delay. Make it faster, or raise "
                 "daq.ahead_blocks or daq.block_samples."
             )
         return "Close other programs, or raise daq.ahead_blocks or daq.block_samples."

@@ -33,6 +33,7 @@ __all__ = [
 ]
 
 _LONGEST_GAP_S, _GAP_FRAMES = 0.25, 10  # without a value, whichever is longer
+_UNUSED_S = 0.1  # at the end of a trial
 ONE_TRIAL = "one trial: the interval only includes the camera's resolution, not the scatter"
 
 
@@ -67,7 +68,7 @@ def normal_equivalent(estimate: Estimate) -> Estimate:
 def _require_covered(seen: Observation, steps: StepTimes) -> None:
     """Refuse a trial in which camera or self-sensing found nothing for too long."""
     start_s = seen.block_start_s[0]
-    ends_s = np.array([start_s, start_s + steps.zero_s + steps.step_s - 0.1])
+    ends_s = np.array([start_s, start_s + steps.zero_s + steps.step_s - _UNUSED_S])
     longest_s = max(_LONGEST_GAP_S, _GAP_FRAMES / steps.frame_rate_hz)
     sensed_s = seen.sensed_s[np.isfinite(seen.capacitance_f)]
     for what, time_s in (("camera frame", seen.frame_time_s), ("capacitance", sensed_s)):
@@ -99,7 +100,7 @@ def collect_trials(
     """
     for seen in trials:
         _require_covered(seen, steps)
-    count = round((steps.zero_s + steps.step_s - 0.1) * steps.frame_rate_hz)
+    count = round((steps.zero_s + steps.step_s - _UNUSED_S) * steps.frame_rate_hz)
     # At the frame times: interpolation half-way between frames at 20 frames/s attenuates ringing of
     # 5 Hz by a third.
     first_s = (trials[0].frame_time_s[0] - trials[0].block_start_s[0]) % (1.0 / steps.frame_rate_hz)

@@ -16,9 +16,10 @@ class CallLimit:
     """A context in which one call may take a limited time; then it raises `TooLongError` there.
 
     A timer's signal interrupts waits and loops in Python. If the code catches the error and goes
-    on, the timer interrupts it again, each time after `limit_s`. Compiled code that never returns to
-    Python cannot be interrupted. There is no limit in threads other than the main one, which alone
-    gets signals, on Windows, which has no such timer, and in a program that uses the timer itself.
+    on, the timer interrupts it again, each time after `limit_s`. Compiled code that never returns
+    to Python cannot be interrupted. There is no limit in threads other than the main one, which
+    alone gets signals, on Windows, which has no such timer, and in a program that uses the timer
+    itself.
 
     Args:
         limit_s: longest time, in s; None: there is no limit.

@@ -82,6 +82,10 @@ def test_a_record_and_a_part_of_it_are_refused_as_two_but_a_repetition_is_not(tm
         with pytest.raises(InputError, match=r"one\.csv and .*part\.csv have the same measured"):
             refuse_copies(files, [Y, again, part])
     refuse_copies(files, [np.zeros(0), np.zeros(0), np.zeros(0)])
+    # The first two share a part, which alone is a warning; the third is a copy of the first.
+    half = np.r_[Y[:750], again[750:]]
+    with pytest.raises(InputError, match=r"one\.csv and .*part\.csv have the same measured"):
+        refuse_copies(files, [Y, half, Y.copy()])
 
 
 def test_picofarads_in_a_column_of_farads_are_refused():

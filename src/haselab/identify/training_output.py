@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from itertools import combinations
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -117,28 +118,27 @@ def share_used(outputs: Sequence[ArrayLike], known: TrainingOutput) -> float:
 
 
 def find_copy(outputs: Sequence[ArrayLike]) -> tuple[int, int, float] | None:
-    """Find two records of which one repeats samples of the other.
+    """Find the two records that have the largest share of samples in common.
 
     Args:
         outputs: of the records, all of one quantity. Shape `(M_r,)` each.
     Returns:
-        Places of both records, and the share of the samples of the second that are in the first;
-        None if there are none.
+        Places of both records, and the share of the samples of one that are in the other; None if
+        no two records share more than 5 %.
     Example:
         >>> y = np.random.default_rng(1).normal(size=(2, 1000))
         >>> find_copy(y), find_copy([y[0], y[1], np.round(y[0, 100:600], 4)])
         (None, (0, 2, 1.0))
     """
-    for one in range(len(outputs)):
-        known = hash_output([outputs[one]])
-        for other in range(one + 1, len(outputs)):
-            # of a long record few windows are kept, so a short part may have none of them
-            both = (share_used([outputs[other]], known),
-                    share_used([outputs[one]], hash_output([outputs[other]])))  # fmt: skip
-            share = max((share for share in both if math.isfinite(share)), default=0.0)
-            if share > _COPIED:
-                return one, other, share
-    return None
+    known = [hash_output([each]) for each in outputs]
+    found: tuple[int, int, float] | None = None
+    for one, other in combinations(range(len(outputs)), 2):
+        # Few windows of a long record are kept, so a short part of it may have none of them.
+        both = share_used([outputs[other]], known[one]), share_used([outputs[one]], known[other])
+        share = max((share for share in both if math.isfinite(share)), default=0.0)
+        if share > (_COPIED if found is None else found[2]):
+            found = one, other, share
+    return found
 
 
 def is_comparable(outputs: Sequence[ArrayLike], known: TrainingOutput) -> bool:

@@ -49,7 +49,6 @@ class _Anything:
         return {} if name in {"quantities", "notes", "figures", "groups", "missing"} else self
 
 
-
 def _stand_in(kind: type) -> Any:
     """A value of a type, so that other experiments find it, without its numbers."""
     empty = {"quantities", "notes", "figures"}

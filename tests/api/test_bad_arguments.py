@@ -127,6 +127,7 @@ CALLS = {
         "input": ("u", COLUMN),
         "output": ("y", COLUMN),
         "rate_hz": (50.0, without(POSITIVE, "nothing")),
+        "time": (None, without(COLUMN, "nothing")),
         "hold": ("zero", without(WORD, "nothing")),
     },
     hl.table: {

@@ -159,6 +159,9 @@ class _Bench:
     def settle(self, drive_v: float, duration_s: float) -> None:
         self.played.append(drive_v)
 
+    def rest(self) -> None:
+        self.played.append(0.0)
+
 
 @pytest.mark.parametrize(
     ("drive_v", "fault"),
@@ -212,8 +215,10 @@ def test_the_code_of_another_package_that_fails_is_named(monkeypatch: pytest.Mon
         analysis_of(REFERENCE).outcome(own)
     monkeypatch.setattr("haselab.study.analysis.experiments_of", lambda study: (own,))
     bench: Any = _Bench()
+    found = play_and_fit(lambda name: None, REFERENCE, describe(TwinConfig()), bench)  # type: ignore[arg-type,return-value]
     with pytest.raises(ResultError, match=r"'play' of the experiment \[own\].*KeyError"):
-        play_and_fit(lambda name: None, REFERENCE, describe(TwinConfig()), bench)  # type: ignore[arg-type,return-value]
+        found.require_complete()
+    assert bench.played[-1] == 0.0
 
 
 def test_a_result_without_a_row_is_refused() -> None:

@@ -19,6 +19,7 @@ from haselab.study.fits.maps import Maps
 from haselab.study.fits.paper_chain import PrintedChain
 from haselab.study.fits.point import Point
 from haselab.study.fits.static import Static
+from haselab.study.fits.trials import Comparison
 
 # Where each experiment calls its fit, and what the message names.
 FITS = {
@@ -47,9 +48,6 @@ class _Anything:
     def __getattr__(self, name: str) -> Any:
         return {} if name in {"quantities", "notes", "figures", "groups", "missing"} else self
 
-    def reason(self, key: str) -> str:
-        return ""
-
 
 def _stand_in(kind: type) -> Any:
     """A value of a type, so that other experiments find it, without its numbers."""
@@ -72,6 +70,8 @@ def test_a_fit_that_refuses_recorded_data_is_a_missing_result(
     where = "haselab.study.experiments."
     for name in FITS:
         stand_in = _stand_in(GIVEN[name]) if name in GIVEN else _Anything()
+        if name == "steps.compare_trials":
+            stand_in = Comparison({}, {}, {}, 0.0)
         monkeypatch.setattr(where + name, lambda *_, value=stand_in, **__: value)
     fixed = {"design.measured_latency": 0.0, "free_response._against_chirp": {}}
     for name, value in (fixed | {"free_response._discussed": ""}).items():

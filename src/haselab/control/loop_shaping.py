@@ -127,6 +127,7 @@ class Design:
             "peak_sensitivity": (margins.peak_sensitivity, ""),
             "crossover_rad_s": (margins.crossover_rad_s, "rad/s"),
             "rise_time_s": (step.rise_time_s, "s"),
+            "raw_rise_time_s": (step.raw_rise_time_s, "s"),
             "overshoot": (step.overshoot, ""),
             "settling_time_s": (step.settling_time_s, "s"),
         }

@@ -88,7 +88,8 @@ class CapacitanceSensor:
             f"Capacitance = {self.capacitance_f:.4g} F is outside {least_f:.4g} to {most_f:.4g} F, "
             f"too far from {low_f:.4g} to {high_f:.4g} F, where the strain map was fitted. Fit a "
             "record in which the length follows the capacitance there, or limit the controller's "
-            "output."
+            "output. If the strain oscillated, the loop may be unstable: check it with haselab "
+            "margins."
         )
 
 

@@ -14,8 +14,8 @@ from haselab.models.plant import Plant, SlowMode
 PLANT = Plant(1.0, 32.1, 0.12, slow_modes=(SlowMode(0.5, 6.0),))
 KEYS = {
     "kp", "ki", "kd", "derivative_filter_s", "phase_margin_deg", "gain_margin_db",
-    "delay_margin_s", "peak_sensitivity", "crossover_rad_s", "rise_time_s", "overshoot",
-    "settling_time_s",
+    "delay_margin_s", "peak_sensitivity", "crossover_rad_s", "rise_time_s",
+    "raw_rise_time_s", "overshoot", "settling_time_s",
 }  # fmt: skip
 
 

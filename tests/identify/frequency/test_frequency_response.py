@@ -75,6 +75,16 @@ def test_intervals_hold_on_all_lines_of_a_sweep_and_no_line_is_biased(level_db):
 
 
 @pytest.mark.long
+def test_print_shows_band_peak_and_coherence_on_one_line():
+    found = estimate(SWEEP, CLEAN, 400.0)
+    said = repr(found)
+    assert said.startswith(f"FrequencyResponse: ok, {found.frequency_hz.size} lines from ")
+    peak_hz = float(said.partition(" at ")[2].partition(" Hz")[0])
+    # Of a resonance of damping z: omega sqrt(1 - 2 z^2); a line every 0.1 Hz.
+    wanted_hz = OMEGA * np.sqrt(1.0 - 2.0 * PLANT.damping_ratio**2) / (2.0 * np.pi)
+    assert abs(peak_hz - wanted_hz) <= 0.05 + 1e-3 and "\n" not in said
+
+
 def test_several_sweeps_are_pooled_whatever_their_lengths():
     shorter = slice(0, 2800)
 

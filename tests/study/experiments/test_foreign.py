@@ -149,9 +149,12 @@ def test_a_signal_during_a_fit_still_ends_the_program(ends: BaseException) -> No
 
 def test_an_experiment_that_exits_while_it_plays_is_named(monkeypatch: Any) -> None:
     monkeypatch.setattr("haselab.study.analysis.experiments_of", lambda study: (own(),))
+    ended: list[str] = []
+    runner: Any = SimpleNamespace(mass_kg=0.25, rest=lambda: ended.append("0 V"))
+    found = play_and_fit(lambda name: None, REFERENCE, RIG, runner)  # type: ignore[arg-type,return-value]
     with pytest.raises(ResultError, match=r"'play' of the experiment \[own\].*sys\.exit\(0\)"):
-        runner = SimpleNamespace(mass_kg=0.25)
-        play_and_fit(lambda name: None, REFERENCE, RIG, runner)  # type: ignore[arg-type,return-value]
+        found.require_complete()
+    assert ended == ["0 V"]
 
 
 @pytest.mark.parametrize(

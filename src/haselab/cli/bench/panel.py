@@ -102,8 +102,9 @@ def command(
         )
         click.echo("\n".join(panel.addresses))
         also = " or, on another computer, the second one" if lan else ""
+        lent = " Whoever has the second address can operate the bench." if lan else ""
         click.echo(
-            f"haselab: Open this address in a browser{also}. Ctrl-C ends the panel.", err=True
+            f"haselab: Open this address in a browser{also}. Ctrl-C ends the panel.{lent}", err=True
         )
         if not no_browser:
             webbrowser.open(panel.addresses[0])

@@ -59,7 +59,9 @@ _BAUD = 115_200  # baud rate of the boot loader
 _BOARD = "atmega2560"
 _GAIN_TOLERANCE = 0.02  # of two statements of the same gain
 _FILLED = 0.8  # of the converter's range, by the current of the largest capacitance
-_PREDICTED = ("rise_time_s", "overshoot", "settling_time_s", "steady_state_error")
+_PREDICTED = (
+    "rise_time_s", "raw_rise_time_s", "overshoot", "settling_time_s", "steady_state_error",
+)  # fmt: skip
 _HIGHEST_PAGE = "0003"  # of 64 kB, as Intel HEX writes it
 _structure = shared_option(
     "--controller", "--structure", "structure",

@@ -35,7 +35,7 @@ RESPONSE_METHODS = ("rational", "polynomial", "h1", "h2", "hv", "periodic")
 _LEAST = 64
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, repr=False)
 class FrequencyResponse:
     """Frequency response at the lines that the input excites.
 
@@ -61,6 +61,20 @@ class FrequencyResponse:
     notes: tuple[str, ...]
     mixing: csr_array | None = None
     status: str = "ok"
+
+    def __repr__(self) -> str:
+        """What `print` shows: status, band, largest gain and lowest coherence."""
+        lines = self.frequency_hz.size
+        if not lines:
+            return f"{type(self).__name__}: {self.status}, no lines"
+        gain = np.abs(self.response)
+        peak = int(np.argmax(gain))
+        low_hz, high_hz = float(self.frequency_hz.min()), float(self.frequency_hz.max())
+        return (
+            f"{type(self).__name__}: {self.status}, {lines} lines from {low_hz:.4g} to "
+            f"{high_hz:.4g} Hz, largest gain {gain[peak]:.4g} at {self.frequency_hz[peak]:.4g} Hz, "
+            f"coherence {float(self.coherence.min()):.3g} or more"
+        )
 
     @property
     def succeeded(self) -> bool:

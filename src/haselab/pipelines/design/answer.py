@@ -96,6 +96,7 @@ def design_answer(design: Design) -> JsonObject:
         "peak_sensitivity": margin.peak_sensitivity,
         "crossover_rad_s": margin.crossover_rad_s,
         "rise_time_s": step.rise_time_s,
+        "raw_rise_time_s": step.raw_rise_time_s,
         "overshoot": step.overshoot,
         "settling_time_s": step.settling_time_s,
         "steady_state_error": step.steady_state_error,

@@ -335,6 +335,7 @@ def loop_row(loop: LoopRun, gains: PidGains | None, plant: Plant) -> JsonObject:
         "loop": loop.name,
         "delay_s": loop.delay_s,
         "rise_time_s": found.rise_time_s,
+        "raw_rise_time_s": found.raw_rise_time_s,
         "overshoot": found.overshoot,
         "settling_time_s": found.settling_time_s,
         "steady_state_error": found.steady_state_error,

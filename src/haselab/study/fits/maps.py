@@ -24,7 +24,8 @@ __all__ = ["Maps", "fit_maps"]
 _COMPARED = (-0.05, 0.10)  # range of the printed saturation, where two maps are compared
 _INSEPARABLE = (
     "not identifiable from this loop, which does not separate two exponentials; its interval only "
-    "serves the comparison with the noise-free fit. The curve is identifiable: S14.rms_difference"
+    "serves the comparison with the noise-free fit. The curve itself is identifiable (S14.zero, "
+    "figure 3)"
 )
 
 Floats = NDArray[np.float64]

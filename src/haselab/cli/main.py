@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import atexit
 import contextlib
 import errno
 import os
@@ -176,6 +177,8 @@ def end_despite_threads(stop: SystemExit) -> None:
         "without waiting for it. Make it a daemon thread, or end it.",
         code,
     )
+    with contextlib.suppress(Exception):
+        atexit._run_exitfuncs()  # one of them takes an armed bench to 0 V
     for stream in (sys.stdout, sys.stderr):
         with contextlib.suppress(OSError, ValueError):
             stream.flush()

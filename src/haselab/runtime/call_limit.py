@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import signal
+import sys
 import threading
 from types import FrameType, TracebackType
 from typing import Any, Self
@@ -29,9 +30,11 @@ class CallLimit:
         self._limit_s = limit_s
         self._previous: Any = None
         self._running = False
+        self._caller: FrameType | None = None
 
     def __enter__(self) -> Self:
         if self._limit_s is not None and _is_free():
+            self._caller = sys._getframe(1)
             self._previous = signal.signal(signal.SIGALRM, self._expired)
             self._running = True
             signal.setitimer(signal.ITIMER_REAL, self._limit_s, self._limit_s)
@@ -45,12 +48,18 @@ class CallLimit:
     ) -> None:
         if self._running:
             signal.setitimer(signal.ITIMER_REAL, 0.0)
-            self._running = False
+            self._running, self._caller = False, None
             signal.signal(signal.SIGALRM, self._previous)
 
     def _expired(self, number: int, frame: FrameType | None) -> None:
-        if frame is None or frame.f_code not in _OWN:  # raised there, the timer would stay on
-            raise TooLongError(f"it took longer than {self._limit_s:g} s")
+        if frame is not None and frame.f_code in _OWN:  # raised there, the timer would stay on
+            return
+        while frame is not None and frame is not self._caller:
+            frame = frame.f_back
+        if frame is None:  # another signal has ended the context before its exit
+            signal.setitimer(signal.ITIMER_REAL, 0.0)
+            return
+        raise TooLongError(f"it took longer than {self._limit_s:g} s")
 
 
 _OWN = {CallLimit.__enter__.__code__, CallLimit.__exit__.__code__}

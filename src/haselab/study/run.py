@@ -38,6 +38,7 @@ from haselab.study.analysis import experiments_of
 from haselab.study.definition import StepStudy, Study, checked_study, recorded_study
 from haselab.study.experiment import ExperimentResult
 from haselab.study.experiments.foreign import declared, foreign, refuse_repeated
+from haselab.study.fits.maps import Maps
 from haselab.study.fits.observe import Observation, observe
 from haselab.study.fits.particle_tracks import sheet_figure
 from haselab.study.known import known_values
@@ -190,8 +191,12 @@ def run_study(
         with recording(rig, options, header, planned) as (session, observer):
 
             def source(name: str) -> Observation:
+                events = session.events()
+                said = {what for _, what in events}
+                if f"start {name}" in said and f"end {name}" not in said:
+                    raise ResultError(f"The recording of {name!r} was cut short.")
                 record = session.experiment(name)
-                return observe(record, session.events(), lockin, sensing, rig.description)
+                return observe(record, events, lockin, sensing, rig.description)
 
             with Runner(
                 rig, session, observer, sensing.carrier_hz, sensing.carrier_v, progress
@@ -201,7 +206,7 @@ def run_study(
                     lambda what: progress.advance(0.0, f"fit: {what}"), fitted=fitted,
                     known={} if options.known is None else known_values(options.known),
                 )  # fmt: skip
-            if study.has("triangle"):
+            if findings.find(Maps) is not None and study.has("triangle"):
                 findings = _with_sheet(findings, session, rig.description)
             findings.require_complete()  # the manifest keeps the reason
     except ResultError:

@@ -74,7 +74,6 @@ def test_intervals_hold_on_all_lines_of_a_sweep_and_no_line_is_biased(level_db):
     assert np.abs(ratio.mean(axis=0))[near].max() < 0.3 + 2.5 / np.sqrt(runs)
 
 
-@pytest.mark.long
 def test_print_shows_band_peak_and_coherence_on_one_line():
     found = estimate(SWEEP, CLEAN, 400.0)
     said = repr(found)
@@ -85,6 +84,7 @@ def test_print_shows_band_peak_and_coherence_on_one_line():
     assert abs(peak_hz - wanted_hz) <= 0.05 + 1e-3 and "\n" not in said
 
 
+@pytest.mark.long
 def test_several_sweeps_are_pooled_whatever_their_lengths():
     shorter = slice(0, 2800)
 

@@ -74,6 +74,12 @@ def test_whole_seconds_are_no_times_of_fast_rows(form: str, tmp_path: Path) -> N
         assert stream.rate_hz is None
 
 
+def test_dates_of_the_same_digits_differ() -> None:
+    _, day = clock_s("1/11/2026 10:00:00") or (0.0, 0)
+    assert clock_s("11/1/2026 10:00:00", day) is None
+    assert clock_s("1/11/2026 10:00:01", day) == (36001.0, day)
+
+
 def test_a_word_among_clock_times_is_named(tmp_path: Path) -> None:
     times = stamps("%Y-%m-%dT%H:%M:%S.%f")
     times[450] = "lost"
@@ -89,7 +95,19 @@ def test_a_column_of_numbers_called_time_comes_first(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize(
-    "text", ["", "12", "12:30", "25:00:00", "2026-13-01T00:00:00", "32.01.2026 00:00:00", "1:2:3"]
+    "text",
+    [
+        "",
+        "12",
+        "12:30",
+        "25:00:00",
+        "2026-13-01T00:00:00",
+        "32.01.2026 00:00:00",
+        "1:2:3",
+        "24:30:00",
+        "12:00:75",
+        "13:00:00 PM",
+    ],
 )
 def test_what_is_no_clock_time(text: str) -> None:
     assert clock_s(text) is None

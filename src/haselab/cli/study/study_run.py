@@ -230,7 +230,8 @@ def _with_advice(error: HaselabError, folder: Path) -> HaselabError:
     if not complete:
         return error
     advice = f"Compute the results of the complete experiments with: haselab analyse {folder}"
-    return type(error)(f"{text_of(error).rstrip('.')}. {advice}")
+    error.args = (f"{text_of(error).rstrip('.')}. {advice}",)  # its class may be another package's
+    return error
 
 
 def require_complete(found: Findings, folder: Path) -> None:

@@ -38,9 +38,11 @@ def clock_s(cell: str, first_day: int | None = None) -> tuple[float, int] | None
         (86400.0, 739704)
     """
     found = _CLOCK.fullmatch(cell.strip().strip('"'))
-    if found is None or int(found["hour"]) > 24 or int(found["minute"]) > 59:
+    if found is None:
         return None
-    hour = int(found["hour"])
+    hour, second = int(found["hour"]), float(found["second"].replace(",", "."))
+    if hour > (12 if found["half"] else 23) or int(found["minute"]) > 59 or second >= 61.0:
+        return None  # a leap second has 60
     if found["half"]:
         hour = hour % 12 + (12 if found["half"].upper() == "PM" else 0)
     year = found["year"] or found["year2"]
@@ -52,11 +54,10 @@ def clock_s(cell: str, first_day: int | None = None) -> tuple[float, int] | None
         except ValueError:
             return None
     elif found["slashes"]:
-        day = -int(found["slashes"].replace("/", ""))
+        day = -int("".join(part.zfill(4) for part in found["slashes"].split("/")))
     first_day = day if first_day is None else first_day
     if day != first_day and min(day, first_day) < 0:
         return None
-    second = float(found["second"].replace(",", "."))
     seconds = _HOUR_S * hour + _MINUTE_S * int(found["minute"]) + second
     if found["sign"]:
         ahead = _HOUR_S * int(found["offset"]) + _MINUTE_S * int(found["minutes"])

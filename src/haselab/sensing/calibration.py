@@ -12,7 +12,14 @@ from numpy.typing import NDArray
 
 from haselab.base import InputError, ResultError
 from haselab.sensing.lockin import Lockin
-from haselab.sensing.sensed import LockinConfig, reason_text
+from haselab.sensing.sensed import (
+    AMPLITUDE_LOST,
+    CARRIER_OFF,
+    CLIPPED,
+    PHASE_OUT,
+    LockinConfig,
+    reason_text,
+)
 
 __all__ = [
     "Calibration",
@@ -264,20 +271,20 @@ def read_reference(
 def _unusable(reasons: NDArray[np.integer[Any]], carrier_hz: float) -> str:
     """What is wrong with most of the blocks that are not valid, and what to check."""
     values, counts = np.unique(reasons, return_counts=True)
-    most = reason_text(int(values[np.argmax(counts)]))
-    if "amplitude lost" in most or "carrier off" in most:
+    most = int(values[np.argmax(counts)])
+    if most & (AMPLITUDE_LOST | CARRIER_OFF):
         return (
             f"show no carrier at {carrier_hz:g} Hz on both monitors. Check the generator and the "
             "reference's leads."
         )
-    if "phase out of band" in most:
+    if most & PHASE_OUT:
         return (
             "have a phase between the monitors that no capacitor has. Check the polarity of the "
             "monitors, that their channels are not swapped, and the reference's leads."
         )
-    if "clipped" in most:
+    if most & CLIPPED:
         return "are clipped. Lower the amplitude of the carrier, or use a smaller reference."
-    return f"cannot be used ({most}). Check the generator and the reference's leads."
+    return f"cannot be used ({reason_text(most)}). Check the generator and the reference's leads."
 
 
 def fit_calibration(

@@ -12,6 +12,12 @@ from numpy.typing import NDArray
 from haselab.base import InputError
 
 __all__ = [
+    "AMPLITUDE_LOST",
+    "CARRIER_OFF",
+    "CLIPPED",
+    "CURRENT_LIMIT",
+    "NOT_FINITE",
+    "PHASE_OUT",
     "REASONS",
     "Levels",
     "LockinConfig",
@@ -39,7 +45,8 @@ REASONS = {
     64: "carrier off",
     128: "disturbed",
 }
-_AMPLITUDE_LOST, _PHASE_OUT, _CLIPPED, _CURRENT_LIMIT, _NOT_FINITE = 1, 2, 4, 8, 32
+AMPLITUDE_LOST, PHASE_OUT, CLIPPED, CARRIER_OFF = 1, 2, 4, 64  # keys of REASONS
+CURRENT_LIMIT, NOT_FINITE = 8, 32
 
 # Amplitude over the standard deviation of a quadrature. Noise alone exceeds it once in 270,000
 # blocks: exp(-5^2 / 2), the tail of its Rayleigh distribution.
@@ -297,8 +304,8 @@ def range_reasons(most: Floats, config: LockinConfig) -> NDArray[np.uint8]:
     Returns:
         Sums of keys of `REASONS`, shape `(blocks,)`.
     """
-    reason = np.where((most >= config.full_scale).any(axis=1), _CLIPPED, 0)
-    reason |= np.where(most[:, 1] >= config.current_limit, _CURRENT_LIMIT, 0)
+    reason = np.where((most >= config.full_scale).any(axis=1), CLIPPED, 0)
+    reason |= np.where(most[:, 1] >= config.current_limit, CURRENT_LIMIT, 0)
     return np.asarray(reason, dtype=np.uint8)
 
 
@@ -355,7 +362,7 @@ def sensed_from_phasors(phasors: Phasors, config: LockinConfig) -> Sensed:
         driven = np.abs(phasors.levels.voltage - config.offsets[0]) > np.abs(voltage)
         clear = driven & (leakage_s > _CLEAR_OF_NOISE * leakage_std_s)
         resistive = clear & ~(2.0 * leakage_s * np.abs(z.imag) < _MOST_LEAKAGE)
-        reason |= np.where(resistive, _PHASE_OUT, 0).astype(np.uint8)
+        reason |= np.where(resistive, PHASE_OUT, 0).astype(np.uint8)
         valid = reason == 0
         capacitance_f, resistance_ohm = _without(
             np.where(clear & valid, leakage_s, 0.0), z, phasors.omega_rad_s
@@ -387,9 +394,9 @@ def _judged(
     there = np.abs(voltage) > np.maximum(floor, _CLEAR_OF_NOISE * phasors.voltage_std)
     there &= np.abs(current) > np.maximum(floor, _CLEAR_OF_NOISE * phasors.current_std)
     finite = np.isfinite(voltage) & np.isfinite(current)
-    reason = phasors.reason | np.where(finite, 0, _NOT_FINITE).astype(np.uint8)
-    lost = finite & ~there & (reason & _NOT_FINITE == 0)
-    reason |= np.where(lost, _AMPLITUDE_LOST, 0).astype(np.uint8)
+    reason = phasors.reason | np.where(finite, 0, NOT_FINITE).astype(np.uint8)
+    lost = finite & ~there & (reason & NOT_FINITE == 0)
+    reason |= np.where(lost, AMPLITUDE_LOST, 0).astype(np.uint8)
     ratio = np.divide(current, voltage, out=np.full_like(voltage, np.nan), where=there & finite)
     whole_s = config.admittance_scale_s * ratio
     if config.scale_s is None:  # the phase of the skew depends on the true frequency of the block
@@ -397,7 +404,7 @@ def _judged(
     y = whole_s - config.stray_s
     with np.errstate(invalid="ignore"):
         plausible = (y.imag > 0.0) & (y.real > -_LARGEST_LEAD * y.imag)
-    reason |= np.where(there & finite & ~plausible, _PHASE_OUT, 0).astype(np.uint8)
+    reason |= np.where(there & finite & ~plausible, PHASE_OUT, 0).astype(np.uint8)
     return reason, whole_s
 
 

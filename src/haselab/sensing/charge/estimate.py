@@ -13,13 +13,21 @@ from haselab.sensing.charge.flat_tops import flat_tops
 from haselab.sensing.charge.noise import Noise, dither_of, hum_of, noise_of
 from haselab.sensing.charge.offset import Offset, fit_offset
 from haselab.sensing.charge.path import Anchors, Path, find_anchors, runs_of
-from haselab.sensing.sensed import Sensed, check_blocks, check_channels
+from haselab.sensing.sensed import (
+    AMPLITUDE_LOST,
+    CLIPPED,
+    CURRENT_LIMIT,
+    NOT_FINITE,
+    PHASE_OUT,
+    Sensed,
+    check_blocks,
+    check_channels,
+)
 
 __all__ = ["Charge", "ChargeConfig"]
 
 Floats = NDArray[np.float64]
 
-_AMPLITUDE_LOST, _PHASE_OUT, _CLIPPED, _CURRENT_LIMIT, _NOT_FINITE = 1, 2, 4, 8, 32
 _DISTURBED = 128
 _SHORTEST = 16  # samples of a block
 _POINTS = 256  # smallest number of points kept of a block that has as many
@@ -235,9 +243,9 @@ def _thinned(v: NDArray[Any], i: NDArray[Any], config: ChargeConfig) -> _Record:
         pp.append(high - low)
         means.append(block[:, :used].reshape(blocks, config.points, config.thinning).mean(axis=2))
     size = np.stack(most, axis=1).reshape(blocks, 2)
-    reason = np.where((size >= config.full_scale).any(axis=1), _CLIPPED, 0)
-    reason |= np.where(size[:, 1] >= config.current_limit, _CURRENT_LIMIT, 0)
-    reason = np.where(np.isfinite(size).all(axis=1), reason, _NOT_FINITE)
+    reason = np.where((size >= config.full_scale).any(axis=1), CLIPPED, 0)
+    reason |= np.where(size[:, 1] >= config.current_limit, CURRENT_LIMIT, 0)
+    reason = np.where(np.isfinite(size).all(axis=1), reason, NOT_FINITE)
     steps = _steps(v, i, reason)
     dither = dither_of(i, float(steps[1]))
     return _Record(means[0], means[1], reason.astype(np.uint8), pp[0], pp[1], steps, dither)
@@ -248,7 +256,7 @@ def _steps(v: NDArray[Any], i: NDArray[Any], reason: NDArray[Any]) -> Floats:
     from haselab.sensing.block.tones import converter_step  # scipy takes half a second to import
 
     length = v.size // max(1, reason.size)
-    fine = np.repeat(reason & _NOT_FINITE == 0, length)
+    fine = np.repeat(reason & NOT_FINITE == 0, length)
     if not fine.any():
         return np.zeros(2)
     steps = converter_step(np.stack([v[fine], i[fine]], axis=1)[np.newaxis])
@@ -325,7 +333,7 @@ def _name_swapped(record: _Record, runs: list[slice], config: ChargeConfig, rows
     if 2 * len(right) > sum(run.stop - run.start for run in runs):
         for block in right:
             rows.reason[block] = 0
-            rows.refuse(block, _PHASE_OUT, "the columns seem swapped")
+            rows.refuse(block, PHASE_OUT, "the columns seem swapped")
 
 
 def _name_skew(
@@ -388,7 +396,7 @@ def _sense_block(
     energy = float(v @ v)
     idle = v.size * noise.v_var / path.smoothing
     if not max(idle / _MOST_COMPENSATION, v.size * (_FEWEST_STEPS * noise.v_step) ** 2) < energy:
-        rows.refuse(block, _AMPLITUDE_LOST, "drive hardly changes")
+        rows.refuse(block, AMPLITUDE_LOST, "drive hardly changes")
         return
     below = energy - idle
     by_time, by_area = float(v @ time[part]), float(v @ area[part])
@@ -425,7 +433,7 @@ def _judge(rows: _Rows) -> None:
     for block in blocks.tolist():
         std, cause = float(rows.variance[block]) ** 0.5, rows.causes[block]
         if rows.kappa[block] < -_CLEAR * std:
-            rows.refuse(block, _PHASE_OUT, "negative: one monitor inverted, or the columns swapped")
+            rows.refuse(block, PHASE_OUT, "negative: one monitor inverted, or the columns swapped")
         elif not std < (_MOST_OF_STEPS if cause == "step" else _MOST_STD) * mean:
-            reason = _AMPLITUDE_LOST if cause == "noise" else _DISTURBED
+            reason = AMPLITUDE_LOST if cause == "noise" else _DISTURBED
             rows.refuse(block, reason, _TOO_UNCERTAIN[cause])

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import threading
+from collections.abc import Iterable
 from pathlib import Path
 from typing import Any
 
@@ -28,7 +29,7 @@ from haselab.store.session.seal import ChangedError
 from haselab.store.session.tail import TailReader
 from haselab.store.text_file import decode_json
 
-__all__ = ["SessionReader", "session_file"]
+__all__ = ["SessionReader", "cut_short", "session_file"]
 
 
 # HDF5 shares the state of a dataset between all handles of a process: while one is open, another
@@ -41,6 +42,23 @@ def session_file(path: str | Path) -> Path:
     """The session file in a run's folder; a path of a file is returned unchanged."""
     path = Path(path)
     return path / "session.h5" if path.is_dir() else path
+
+
+def cut_short(events: Iterable[tuple[float, str]]) -> tuple[str, ...]:
+    """Names of the experiments whose recording has a start and no end.
+
+    Args:
+        events: of a session, as a reader or a writer returns them.
+    """
+    found = list(events)
+    ended = _named(found, "end")
+    return tuple(name for name in _named(found, "start") if name not in ended)
+
+
+def _named(events: Iterable[tuple[float, str]], verb: str) -> tuple[str, ...]:
+    """Names of the experiments in the events that begin with a verb."""
+    said = (what.partition(" ") for _, what in events)
+    return tuple(name for first, _, name in said if first == verb)
 
 
 class SessionReader(Closing):
@@ -176,7 +194,7 @@ class SessionReader(Closing):
         Raises:
             InputError: the events cannot be read.
         """
-        return tuple(name for verb, name in self._named_events() if verb == "end")
+        return _named(self.events(), "end")
 
     def cut_short(self) -> tuple[str, ...]:
         """Names of the experiments whose recording has a start and no end.
@@ -184,13 +202,7 @@ class SessionReader(Closing):
         Raises:
             InputError: the events cannot be read.
         """
-        ended = self.complete()
-        started = [name for verb, name in self._named_events() if verb == "start"]
-        return tuple(name for name in started if name not in ended)
-
-    def _named_events(self) -> list[tuple[str, str]]:
-        """Verb and name of each event."""
-        return [(verb, name) for verb, _, name in (e.partition(" ") for _, e in self.events())]
+        return cut_short(self.events())
 
     def conditions(self) -> NDArray[np.void]:
         """What acted on the actuator outside the blocks, in the order of time.

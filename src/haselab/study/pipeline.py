@@ -136,9 +136,7 @@ def play_and_fit(
 def _play(analysis: Analysis, runner: Runner) -> dict[str, ResultError]:
     """Play the experiments; return why some were not played, by their tables."""
     left_out: dict[str, ResultError] = {}
-    waiting = list(analysis.experiments)
-    while waiting:
-        experiment = waiting.pop(0)
+    for place, experiment in enumerate(analysis.experiments):
         try:
             with foreign(experiment, "play"):
                 experiment.play(Player(runner, experiment, analysis))
@@ -146,7 +144,7 @@ def _play(analysis: Analysis, runner: Runner) -> dict[str, ResultError]:
             left_out[experiment.table] = reason
         except ResultError as failure:  # nobody knows whether the rest may be played
             runner.rest()
-            left_out |= dict.fromkeys((one.table for one in (experiment, *waiting)), failure)
+            left_out |= {one.table: failure for one in analysis.experiments[place:]}
             break
     return left_out
 

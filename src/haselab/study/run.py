@@ -30,7 +30,7 @@ from haselab.safety.guarded import GuardedRig, guard
 from haselab.safety.state_machine import Safety, SafetySettings
 from haselab.safety.watchdog.settings import WatchdogSettings
 from haselab.store.manifest import Manifest, read_manifest
-from haselab.store.session.reader import session_file
+from haselab.store.session.reader import cut_short, session_file
 from haselab.store.session.writer import ExperimentPlan, QueueRule, SessionReader, SessionWriter
 from haselab.store.source_commit import source_commit
 from haselab.store.toml import validated
@@ -192,8 +192,7 @@ def run_study(
 
             def source(name: str) -> Observation:
                 events = session.events()
-                said = {what for _, what in events}
-                if f"start {name}" in said and f"end {name}" not in said:
+                if name in cut_short(events):
                     raise ResultError(f"The recording of {name!r} was cut short.")
                 record = session.experiment(name)
                 return observe(record, events, lockin, sensing, rig.description)

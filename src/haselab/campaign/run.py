@@ -23,6 +23,7 @@ __all__ = ["Progressed", "run_cases"]
 # Computing time of a chunk, so that the time between two is small against it; and so much of it for
 # each worker, because this program takes about 10 ms for each chunk of any worker.
 _CHUNK_S, _CHUNK_S_FOR_EACH = 1.0, 0.02
+_LEAST_S = 0.1  # of a chunk at the end
 _MOST_IN_CHUNK = 2000
 _AHEAD = 2  # chunks for each worker: one in work and one that waits
 _BLOCKS = 1000  # into which the cases are divided for claims
@@ -210,11 +211,11 @@ class _Run:
         return self._waiting(block)
 
     def _chunk_size(self, workers: int) -> int:
-        """Cases that take a second or more; fewer at the end, so that all workers end together."""
+        """Cases that take a second or more; down to 0.1 s at the end, so that all end together."""
         if self._each_s == 0.0:
             return 1
         left = len(self._queue) + sum(len(self._left[block]) for block in self._blocks)
-        share = max(1, left // (2 * _AHEAD * workers))
+        share = max(round(_LEAST_S / self._each_s), left // (2 * _AHEAD * workers))
         wanted_s = max(_CHUNK_S, _CHUNK_S_FOR_EACH * workers)
         return max(1, min(round(wanted_s / self._each_s), share, _MOST_IN_CHUNK))
 

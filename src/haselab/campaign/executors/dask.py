@@ -7,6 +7,7 @@ worker that vanishes costs the cases in work and nothing else.
 from __future__ import annotations
 
 import logging
+import multiprocessing
 import os
 import queue
 from typing import Any
@@ -15,6 +16,7 @@ from haselab.base import DeviceError, HaselabError, InputError, text_of
 from haselab.campaign.executors.executor import Chunk, Outcome
 from haselab.campaign.plan import Problem
 from haselab.campaign.work import compute_cases
+from haselab.runtime.scheduling import one_thread
 from haselab.store.optional import library
 
 __all__ = ["LOCAL", "DaskExecutor"]
@@ -32,6 +34,17 @@ _LOCAL_CONFIG = {
     "distributed.admin.tick.interval": "1s",
     "distributed.admin.system-monitor.interval": "5s",
 }
+
+
+def _start_method() -> dict[str, str]:
+    """Start workers as copies of one process that has imported all; where the system can do so."""
+    if "forkserver" not in multiprocessing.get_all_start_methods():
+        return {}
+    method = {"distributed.worker.multiprocessing-method": "forkserver"}
+    with library("dask", _EXTRA).config.set(method):
+        library("distributed.utils", _EXTRA).get_mp_context()  # sets a list of imports, once
+    multiprocessing.set_forkserver_preload(["distributed", compute_cases.__module__])
+    return method
 
 
 def _silence() -> None:
@@ -59,9 +72,10 @@ class DaskExecutor:
         self._cluster: Any = None
         try:
             if address == LOCAL:
-                with library("dask", _EXTRA).config.set(_LOCAL_CONFIG):
+                config = library("dask", _EXTRA).config
+                with config.set({**_LOCAL_CONFIG, **_start_method()}), one_thread():
                     self._cluster = distributed.LocalCluster(
-                        n_workers=workers, threads_per_worker=1, dashboard_address=None,
+                        n_workers=workers, threads_per_worker=1, dashboard_address=":0",
                         silence_logs=logging.CRITICAL,
                     )  # fmt: skip
             self._client = distributed.Client(

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import contextlib
 import json
+import os
 import random
 import signal
 import subprocess
@@ -106,12 +107,15 @@ def test_killed_workers_and_a_killed_program_change_no_bit(campaigns: Any) -> No
     assert campaigns.table("out") == campaigns.table("undisturbed")
 
 
-def test_ctrl_c_says_what_is_kept_and_a_second_start_needs_only_the_rest(campaigns: Any) -> None:
+@pytest.mark.parametrize("options", [(), ("--scheduler", "local")])
+def test_ctrl_c_says_what_is_kept_and_a_second_start_needs_only_the_rest(
+    campaigns: Any, options: tuple[str, ...]
+) -> None:
     text = SLOW.format(samples=6)
     campaigns.run("undisturbed", text)
-    first = Command(campaigns.folder, "out", "--workers", "1")
+    first = Command(campaigns.folder, "out", "--workers", "1", *options)
     assert first.until_shards(1)
-    first.process.send_signal(signal.SIGINT)
+    os.killpg(first.process.pid, signal.SIGINT)  # as a terminal does
     code, out, err = first.end()
     assert (code, out) == (130, "") and err.strip().count("\n") == 0
     assert "of 6 cases are finished and kept; the same command continues." in err

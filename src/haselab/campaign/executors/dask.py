@@ -33,6 +33,8 @@ _LOCAL_CONFIG = {
     "distributed.worker.memory.monitor-interval": "2s",
     "distributed.admin.tick.interval": "1s",
     "distributed.admin.system-monitor.interval": "5s",
+    # Ctrl-C reaches all programs of a terminal, and is for the one that started the cluster.
+    "distributed.worker.preload": ["import signal; signal.signal(signal.SIGINT, signal.SIG_IGN)"],
 }
 
 

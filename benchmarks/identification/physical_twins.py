@@ -110,7 +110,7 @@ def _played(config: TwinConfig, study: Study, seed: int, run: Path) -> MotionRec
     rig = guard(make_twin(config, seed), Safety(SafetySettings()))
     arm_simulated(rig)
     options = RunOptions(run, seed, "none", config.model_dump(mode="json"))
-    run_study(study, rig, options, SilentProgress())
+    run_study(study, rig, options, SilentProgress()).require_complete()
     with SessionReader(run) as reader:
         return motion_of_session(reader, run)
 

@@ -190,6 +190,8 @@ def _execute(
                 if isinstance(by_model, str):
                     rows = "S25 (observer), S27 and S30"
                     click.echo(f"haselab: {rows} were left out: {by_model}", err=True)
+        elif modelled is not None:
+            click.echo("haselab: no physical model, because an experiment failed.", err=True)
         if noise_free_run is not None:
             progress.advance(0.0, "noise-free reference run")
             noise_free = _noise_free(noise_free_run)

@@ -287,7 +287,7 @@ def _describe(
     residuals = tuple(r.y - fitted.simulate(r.u, r.rate_hz, float(r.u[0])) for r in records)
     counted = [e[mask] for e, mask in zip(residuals, masks, strict=True)]
     measured = [r.y[mask] for r, mask in zip(records, masks, strict=True)]
-    clipped = next(filter(None, (clipping_of(r.y, "outputs") for r in records)), "")
+    clipped = next(filter(None, (clipping_of(r.y[r.first :], "outputs") for r in records)), "")
     if clipped or not _related(measured, counted):
         reason = clipped or "the output does not follow the input; check the columns"
         reason = f"no result: {reason}"

@@ -95,4 +95,5 @@ def with_model_rows(found: Findings, played: Findings | str) -> Findings:
         notes={**found.notes, **played.notes},
         charts=(*found.charts, *played.charts),
         missing={**found.missing, **played.missing},
+        failed=(*found.failed, *played.failed),
     )

@@ -5,8 +5,9 @@ import pytest
 
 from haselab.base import InputError, ResultError
 from haselab.control.gains import Saturation
-from haselab.control.reach import reachable_range
+from haselab.control.reach import default_step, reachable_range
 from haselab.control.simulate import LoopSetting
+from haselab.models import RationalModel
 from haselab.models.actuator import ActuatorTables
 from haselab.models.maps import VoltageMap
 from haselab.rig.chip.design import strains_within
@@ -31,6 +32,20 @@ def test_an_actuator_that_is_unstrained_at_0_v_has_limits_from_zero_strain_on(wa
 def test_a_drive_that_does_not_reach_zero_strain_is_refused_with_its_voltage():
     with pytest.raises(ResultError, match=r"zero strain at 0\.0143 V, but .* \[1, 6\] V"):
         reachable_range(Saturation(), FROM_REST, 1.0, 6.0)
+
+
+@pytest.mark.parametrize(
+    ("gain", "limits", "step"),
+    [
+        (1.0, (-0.03, 0.03), 0.015),  # upwards where both sides are equal
+        (-1.0, (-0.03, 0.03), 0.015),
+        (-1.0, (-0.1, 0.02), 0.04),  # a plant that reverses reaches 0.04 with its lower limit
+        (1.0, (-0.02, 0.015), -0.01),
+    ],
+)
+def test_the_usual_step_is_upwards_unless_only_the_other_side_is_large(gain, limits, step):
+    plant = RationalModel((gain,), (1.0, 1.0))
+    assert default_step(plant, Saturation(*limits)) == pytest.approx(step)
 
 
 def test_limits_without_zero_strain_are_refused_as_limits():

@@ -54,6 +54,10 @@ _SHARED: dict[str, tuple[str | None, str]] = {
     "--method": (None, "Choose the method."),
     "--model": (None, "Choose the model."),
     "--no-browser": (None, "Print the address only; open no browser."),
+    "--page-port": (
+        None,
+        "Set the TCP port of the page. 0 uses a free one.",
+    ),
     "--out": (None, "Write the result to this path."),
     "--output": ("COLUMN", "Name the column of the output."),
     "--physical-model/--no-physical-model": (

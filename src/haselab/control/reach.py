@@ -53,16 +53,17 @@ def default_step(plant: AnyPlant, limits: Saturation) -> float:
         limits: of the controller's output.
     Returns:
         0.04; where the limits do not allow that, half of the larger step that they allow, in the
-        direction of it.
+        direction of it, which is upwards if both are equal.
     Example:
         >>> plant = Plant(0.8, 60.0, 0.2)
         >>> default_step(plant, Saturation()), default_step(plant, Saturation(-0.02, 0.015))
         (0.04, -0.008)
     """
     gain = PlantScale.of(plant).gain
-    if integrates(plant) or gain * limits.low <= _STEP <= gain * limits.high:
+    low, high = sorted((gain * limits.low, gain * limits.high))
+    if integrates(plant) or low <= _STEP <= high:
         return _STEP
-    return _OF_REACH * gain * max(limits.low, limits.high, key=abs)
+    return _OF_REACH * (high if high >= -low else low)
 
 
 def reachable_range(

@@ -30,19 +30,21 @@ __all__ = ["pick_points"]
 
 
 def pick_points(
-    video: Path, out: Path | None, *, browser: bool, announce: Callable[[str], None]
+    video: Path, out: Path | None, port: int, *, browser: bool, announce: Callable[[str], None]
 ) -> JsonObject | int:
     """Serve the page until points are saved.
 
     Args:
         video: to pick points in.
         out: table of points; None: beside the video.
+        port: TCP port of the page; 0: a free one.
         browser: open the page in a browser.
         announce: called with the address of the page.
     Returns:
         What was saved: `path`, `points`, `command`, `scale_mm_per_px`; or the number of the signal
         that ended the server.
     Raises:
+        DeviceError: the port is in use.
         InputError: the video cannot be read.
     """
     videos = Videos(video.parent, video, out)
@@ -60,7 +62,7 @@ def pick_points(
     def end_once_saved(name: str) -> None:
         server.should_exit = server.should_exit or bool(saved)
 
-    with listening(0) as listeners:
+    with listening(port) as listeners:
         access = Access(listeners[0].getsockname()[1])
         requests = {name: partial(do, videos) for name, do in PICK_REQUESTS.items()}
         application = Starlette(

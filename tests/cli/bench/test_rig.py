@@ -158,6 +158,16 @@ def test_a_check_whose_guardians_are_lost_ends(rig: Path, capsys, monkeypatch) -
     assert re.search(r"Guardian [12] (\(process|has ended)", err)
 
 
+def test_all_missing_drivers_are_named_at_once(rig: Path, capsys, monkeypatch) -> None:
+    for package in ("nidaqmx", "pyvisa", "serial"):
+        monkeypatch.setitem(sys.modules, package, None)  # import raises ModuleNotFoundError
+    code, out, err = call(capsys, "rig", "check", rig)
+    assert code == 4 and "FAILED  mock  drivers" in out
+    assert err.count("needs the Python package") == 3, err
+    for section, package in (("daq", "nidaqmx"), ("generator", "pyvisa"), ("supply", "serial")):
+        assert f"{section}: " in err and f"'{package}'" in err.partition(f"{section}: ")[2]
+
+
 def test_a_bench_that_a_program_uses_is_left_alone(rig: Path, capsys) -> None:
     file = load_rig(rig)
     assert isinstance(file, BenchConfig)

@@ -7,6 +7,7 @@ import os
 import re
 import shlex
 import signal
+import socket
 import subprocess
 import sys
 import threading
@@ -622,3 +623,15 @@ def test_what_cannot_be_picked_ends_before_a_page_is_served(
     process.communicate()
     late.cancel()
     assert message in line and process.returncode == 2
+
+
+def test_the_port_of_the_page_is_chosen_and_refused_if_in_use(video: Path) -> None:
+    with socket.create_server(("127.0.0.1", 0)) as listener:
+        port = listener.getsockname()[1]
+        process, line = pick(str(video), "--page-port", str(port))
+        process.communicate()
+        assert f"{port}" in line and process.returncode == 4, line
+    process, line = pick(str(video), "--page-port", str(port))
+    assert line.startswith(f"http://127.0.0.1:{port}/?token=")
+    process.send_signal(signal.SIGINT)
+    process.communicate()

@@ -60,10 +60,7 @@ def _check_lan(context: click.Context, option: click.Parameter, value: str) -> s
     "--runs", type=click.Path(path_type=Path, file_okay=False), default=Path("out"),
     show_default=True, metavar="DIR", help="Write recordings to this folder, and list those in it.",
 )  # fmt: skip
-@click.option(
-    "--page-port", type=click.IntRange(0, 65535), default=0, show_default=True,
-    help="Set the TCP port of the page. 0 uses a free one.",
-)  # fmt: skip
+@shared_option("--page-port", type=click.IntRange(0, 65535), default=0, show_default=True)
 @click.option(
     "--lease-s", type=Real(0.5, 10.0), default=1.5, show_default=True,
     help="Set how long the page that armed the bench may be silent, in s, before the output goes "

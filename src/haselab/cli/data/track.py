@@ -312,6 +312,7 @@ def _request(options: dict[str, Any]) -> _Request:
     help="Choose the points on a page in the browser, and save them only.",
 )
 @shared_option("--no-browser", is_flag=True)
+@shared_option("--page-port", type=click.IntRange(0, 65535), default=0, show_default=True)
 @click.option("--count", type=click.IntRange(1), default=300, show_default=True,
     help="Find at most this many particles.",
 )  # fmt: skip
@@ -395,6 +396,7 @@ def command(
     auto: bool,
     pick: bool,
     no_browser: bool,
+    page_port: int,
     link: bool,
     unverified: bool,
     as_json: bool,
@@ -410,10 +412,10 @@ def command(
     computer shows the video; the command ends when the points are saved.
     """
     if pick:
-        save_picked(video, out, no_browser=no_browser, as_json=as_json)
+        save_picked(video, out, page_port, no_browser=no_browser, as_json=as_json)
         return
-    if no_browser:
-        raise click.UsageError("--no-browser needs --pick.")
+    if no_browser or page_port:
+        raise click.UsageError(f"--{'no-browser' if no_browser else 'page-port'} needs --pick.")
     if out is None:
         raise click.UsageError("Missing option '--out': the CSV file for the tracks.")
     request = _request(options)

@@ -10,7 +10,7 @@ from haselab.cli.common import emit
 
 __all__ = ["save_picked"]
 
-_WITH_PICK = {"video", "pick", "no_browser", "out", "force", "as_json", "debug"}
+_WITH_PICK = {"video", "pick", "no_browser", "page_port", "out", "force", "as_json", "debug"}
 
 
 def _announce(address: str, as_json: bool) -> None:
@@ -33,12 +33,15 @@ def _refuse_others() -> None:
             )
 
 
-def save_picked(video: Path, out: Path | None, *, no_browser: bool, as_json: bool) -> None:
+def save_picked(
+    video: Path, out: Path | None, page_port: int, *, no_browser: bool, as_json: bool
+) -> None:
     """Serve the page until points are saved, and print where they are.
 
     Args:
         video: to pick points in.
         out: table of points; None: beside the video.
+        page_port: TCP port of the page; 0: a free one.
         no_browser: only print the address.
         as_json: print one JSON document; the address is then on stderr.
     Raises:
@@ -48,8 +51,9 @@ def save_picked(video: Path, out: Path | None, *, no_browser: bool, as_json: boo
 
     _refuse_others()
     found = pick_points(
-        video, out, browser=not no_browser, announce=lambda address: _announce(address, as_json)
-    )
+        video, out, page_port, browser=not no_browser,
+        announce=lambda address: _announce(address, as_json),
+    )  # fmt: skip
     if isinstance(found, int):
         raise KeyboardInterrupt
     emit(found, as_json=as_json, out=None)

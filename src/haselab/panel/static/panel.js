@@ -7,14 +7,29 @@ const STALE_MS = 450;
 let frame = null;
 let charts = null;
 let redraw = () => {};
-let pending = false;
+let drawing = false;
 
 const link = new Link((found) => {
   frame = found;
-  if (pending) return; // only the newest frame is drawn
-  pending = true;
-  requestAnimationFrame(async () => { try { await draw(); } finally { pending = false; } });
+  if (!drawing) drawNewest();
 }, () => redraw());
+
+// Half of the time at most, so that a slow computer is free for STOP.
+async function drawNewest() {
+  drawing = true;
+  try {
+    for (let drawn = null; drawn !== frame;) {
+      await new Promise((resolve) => requestAnimationFrame(resolve));
+      drawn = frame;
+      const begun_ms = performance.now();
+      await draw();
+      const took_ms = performance.now() - begun_ms;
+      await new Promise((resolve) => setTimeout(resolve, took_ms));
+    }
+  } finally {
+    drawing = false;
+  }
+}
 
 async function draw() {
   redraw();

@@ -2,6 +2,7 @@
 
 import numpy as np
 import pytest
+from scipy.signal import lfilter
 
 from haselab.base import InputError
 from haselab.cli.identify.common import refuse_copies
@@ -72,6 +73,20 @@ def test_an_equation_whose_output_is_noise_has_no_result(seed):
     # 10 standard deviations of a gain that 1,500 samples of unit noise and this input give
     weak = noise + 10.0 / np.sqrt(U.size * U.var()) * np.r_[0.0, U[:-1]]
     assert fit_arx(Record.sampled(U, weak, 100.0)).status == "ok"
+
+
+@pytest.mark.parametrize("noise", ["moving average", "hum", "walk"])
+def test_an_equation_whose_output_is_coloured_noise_has_no_result(noise):
+    white = np.random.default_rng(4).standard_normal(TIME_S.size)
+    v = {
+        "moving average": lfilter([1.0, 0.9, 0.8, 0.5], [1.0], white),
+        "hum": np.sin(2.0 * np.pi * 12.57 * TIME_S) + 0.1 * white,
+        "walk": np.cumsum(white) + 5.0 * white[::-1],
+    }[noise]
+    v *= np.std(Y) / np.std(v)
+    assert "does not respond to the input" in fit_arx(Record.sampled(U, v, 100.0)).status
+    # as large as the signal, it does not hide the response
+    assert fit_arx(Record.sampled(U, Y + v, 100.0)).status == "ok"
 
 
 def test_a_record_and_a_part_of_it_are_refused_as_two_but_a_repetition_is_not(tmp_path):

@@ -423,7 +423,7 @@ def _fit(
         )
     elif whiteness < _WHITE:
         status, covariance = _with_bias(solved, u, y, orders, rate_hz, whiteness)
-    elif _response_p(solved, orders) > _RESPONDS:
+    if status == "ok" and _response_p(solved, orders, white=whiteness >= _WHITE) > _RESPONDS:
         status = (
             "no result: the output does not respond to the input; check the columns and the sensor"
         )
@@ -457,17 +457,24 @@ def _fit(
     return replace(fit, notes=_notes(fit, model))
 
 
-def _response_p(solved: _Solved, orders: ArxOrders) -> float:
+def _response_p(solved: _Solved, orders: ArxOrders, *, white: bool) -> float:
     """Probability of such coefficients of the input if the output does not depend on it.
 
     It allows for the choice of the delay, the one of largest effect, among `_SEARCH_DELAY`.
     """
     b = solved.coefficients[orders.na :]
-    part = solved.covariance[orders.na :, orders.na :]
+    covariance = solved.covariance if white else _coloured(solved)
+    part = covariance[orders.na :, orders.na :]
     if not np.abs(solved.errors).max() > 0.0:
         return 0.0
     size = float(b @ np.linalg.pinv(part, hermitian=True) @ b)
     return float(min(_SEARCH_DELAY * chdtrc(b.size, size), 1.0))
+
+
+def _coloured(solved: _Solved) -> Floats:
+    """Covariance of the coefficients for coloured prediction errors."""
+    wide = coloured_covariance([solved.columns], [solved.errors], solved.columns.shape[1])
+    return wide[: solved.coefficients.size, : solved.coefficients.size]
 
 
 def _with_bias(
@@ -475,8 +482,7 @@ def _with_bias(
 ) -> tuple[str, Floats]:
     """Status, and a covariance that includes the bias, where the prediction errors are coloured."""
     size, constant = solved.coefficients.size, solved.columns.shape[1] > solved.coefficients.size
-    wide = coloured_covariance([solved.columns], [solved.errors], solved.columns.shape[1])
-    covariance = wide[:size, :size]
+    covariance = _coloured(solved)
     unbiased = instrumental_coefficients(u, y, orders.numbers, orders.memory, constant=constant)
     if unbiased is None or not np.isfinite(covariance).all():
         return "ok", solved.covariance if unbiased is None else covariance

@@ -10,7 +10,6 @@ from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
-from scipy.special import chdtrc
 
 from haselab.base import (
     Estimate,
@@ -33,6 +32,7 @@ from haselab.identify.sampled.record import (
     single_driven_record,
     single_record,
 )
+from haselab.identify.sampled.responds import responds
 from haselab.models import ArxModel
 from haselab.models.filters import lfilter
 
@@ -46,7 +46,6 @@ _SEARCH_DELAY = 12
 _WHITE = 0.05
 _COLOURED = 1e-3  # whiteness below which a difference from unbiased coefficients counts
 _BIASED = 1.5  # times the error of a simulation with unbiased coefficients: no result
-_RESPONDS = 0.01  # p-value above which a response of the output to the input is not shown
 _CONSTANT = 2.5  # standard deviations of a constant that is part of the equation
 _UNKNOWN = (-math.inf, math.inf)
 
@@ -423,7 +422,7 @@ def _fit(
         )
     elif whiteness < _WHITE:
         status, covariance = _with_bias(solved, u, y, orders, rate_hz, whiteness)
-    if status == "ok" and _response_p(solved, orders, white=whiteness >= _WHITE) > _RESPONDS:
+    if status == "ok" and not _responds(solved, orders, white=whiteness >= _WHITE):
         status = (
             "no result: the output does not respond to the input; check the columns and the sensor"
         )
@@ -457,18 +456,13 @@ def _fit(
     return replace(fit, notes=_notes(fit, model))
 
 
-def _response_p(solved: _Solved, orders: ArxOrders, *, white: bool) -> float:
-    """Probability of such coefficients of the input if the output does not depend on it.
-
-    It allows for the choice of the delay, the one of largest effect, among `_SEARCH_DELAY`.
-    """
-    b = solved.coefficients[orders.na :]
+def _responds(solved: _Solved, orders: ArxOrders, *, white: bool) -> bool:
+    """Whether the output depends on the input, with the delay of largest effect."""
+    if not np.abs(solved.errors).max() > 0.0:
+        return True
     covariance = solved.covariance if white else _coloured(solved)
     part = covariance[orders.na :, orders.na :]
-    if not np.abs(solved.errors).max() > 0.0:
-        return 0.0
-    size = float(b @ np.linalg.pinv(part, hermitian=True) @ b)
-    return float(min(_SEARCH_DELAY * chdtrc(b.size, size), 1.0))
+    return responds(solved.coefficients[orders.na :], part, trials=_SEARCH_DELAY)
 
 
 def _coloured(solved: _Solved) -> Floats:

@@ -14,7 +14,12 @@ from haselab.base import Estimate, InputError, JsonObject, checked, generator
 from haselab.base.chart import Chart
 from haselab.identify.clipped import clipping_of
 from haselab.identify.fit import RecordFit, rescaled
-from haselab.identify.noise import autoregression, fit_percent, whiteness_p
+from haselab.identify.noise import (
+    autoregression,
+    coloured_covariance,
+    fit_percent,
+    whiteness_p,
+)
 from haselab.identify.record import Record, finite_vector
 from haselab.identify.sampled.record import (
     check_same_rate,
@@ -22,6 +27,7 @@ from haselab.identify.sampled.record import (
     single_driven_record,
     single_record,
 )
+from haselab.identify.sampled.responds import responds
 from haselab.models import StateSpaceModel
 from haselab.models.filters import lfilter
 
@@ -32,6 +38,8 @@ Complexes = NDArray[np.complex128]
 _MOST_ORDER = 10
 _LEAST_GAP = 1e-12
 _WHITE = 0.05
+_LASTS = 0.1  # share of an oscillation that is left at the end of the record
+_MOST = 1e100  # of an output, whose square is summed
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -162,18 +170,25 @@ def fit_subspace(
     inputs, outputs = record.u - point[0], record.y - point[1]
     values, space = _space(inputs, outputs, block_rows)
     count = _gap(values) if order is None else order
-    clipped = clipping_of(record.y, "outputs")
-    if clipped or values[count - 1] <= _LEAST_GAP * values[0]:
+    model, simulated = _model(inputs, outputs, space[:, :count], rate_hz)
+    residuals = outputs - simulated
+    status = ""
+    if clipped := clipping_of(record.y, "outputs"):
+        status = f"no result: {clipped}"
+    elif values[count - 1] <= _LEAST_GAP * values[0]:
+        status = f"no result: the data do not support {count} states; lower the order"
+    elif not _responds(model, inputs, residuals):
+        status = (
+            f"no result: with {count} states, no response of the output to the input is seen; "
+            "check the columns and the sensor, or change the order"
+        )
+    if status:
         none = Estimate(math.nan, math.inf, (-math.inf, math.inf), "")
-        why = clipped or f"the data do not support {count} states; lower the order"
-        reason = f"no result: {why}"
         return SubspaceFit(
-            status=reason, record=record, operating_point=point, model=None,
+            status=status, record=record, operating_point=point, model=None,
             singular_values=values, static_gain=none, modes=(), fit_percent=math.nan,
             residual_whiteness_p=math.nan,
         )  # fmt: skip
-    model, simulated = _model(inputs, outputs, space[:, :count], rate_hz)
-    residuals = outputs - simulated
     rng = generator(seed)
     repeats = [
         _model(inputs, again, _space(inputs, again, block_rows)[1][:, :count], rate_hz)[0]
@@ -186,7 +201,7 @@ def fit_subspace(
         parameters=columns.estimates,
         covariance=columns.covariance,
         residuals=(residuals,),
-        notes=_notes(model, whiteness),
+        notes=_notes(model, whiteness, record.y.size),
         record=record,
         operating_point=point,
         model=model,
@@ -239,15 +254,31 @@ def _model(u: Floats, y: Floats, space: Floats, rate_hz: float) -> tuple[StateSp
     a = np.asarray(shift, dtype=np.float64)
     size = a.shape[0]
     frame = StateSpaceModel(a, np.zeros(size), space[0], 0.0, rate_hz)
-    single_driven_record, free = frame.responses(u)
-    columns = np.column_stack([single_driven_record, u, free])
-    if not np.isfinite(columns).all():
+    columns = _columns(frame, u)
+    if columns is None:
         return frame, np.zeros(y.size)
     scale = np.sqrt((columns**2).sum(axis=0))
     scale[scale == 0.0] = 1.0
     numbers = np.linalg.lstsq(columns / scale, y, rcond=None)[0] / scale
     model = StateSpaceModel(a, numbers[:size], space[0], float(numbers[size]), rate_hz)
     return model, np.asarray(columns @ numbers)
+
+
+def _columns(model: StateSpaceModel, u: Floats) -> Floats | None:
+    """Outputs by each of b, d and the initial states, `(N, 2 n + 1)`; None: they grow too far."""
+    driven, free = model.responses(u)
+    columns = np.column_stack([driven, u, free])
+    return columns if np.abs(columns).max() < _MOST else None
+
+
+def _responds(model: StateSpaceModel, u: Floats, residuals: Floats) -> bool:
+    """Whether b and d, at these poles, are not by chance."""
+    columns = _columns(model, u)
+    if columns is None or not np.abs(residuals).max() > 0.0:
+        return True
+    size = model.b.size + 1
+    covariance = coloured_covariance([columns], [residuals], columns.shape[1])
+    return responds(np.append(model.b, model.d), covariance[:size, :size])
 
 
 def _repeated(
@@ -337,10 +368,17 @@ def _estimate(value: float, repeats: list[float], unit: str) -> Estimate:
     return Estimate.normal(value, 0.5 * float(high - low), unit)
 
 
-def _notes(model: StateSpaceModel, whiteness: float) -> tuple[str, ...]:
+def _notes(model: StateSpaceModel, whiteness: float, samples: int) -> tuple[str, ...]:
     notes = []
     if not model.is_stable:
         notes.append("The model is unstable; lower the order, or record longer.")
+    lasting = model.poles[(np.abs(model.poles) ** samples > _LASTS) & (model.poles.imag > 0.0)]
+    if lasting.size:
+        shown = ", ".join(f"{one:.4g}" for one in np.angle(lasting) * model.rate_hz / (2.0 * np.pi))
+        notes.append(
+            f"An oscillation at {shown} Hz hardly decays within the record. It may be hum rather "
+            "than the actuator."
+        )
     if whiteness < _WHITE:
         notes.append(
             f"Output minus simulation is not white (p = {whiteness:.2g}): the noise is coloured, "

@@ -11,7 +11,7 @@ from typing import Literal, Protocol, Self
 import numpy as np
 from numpy.typing import NDArray
 
-from haselab.base import HaselabError, ResultError
+from haselab.base import HaselabError, InputError, ResultError
 from haselab.rig import Camera, Frames
 from haselab.rig.cameras.source import KnownCamera
 from haselab.runtime.helper_process import HelperProcess
@@ -95,7 +95,11 @@ class _Particles:
         found = found[(found[:, 1] > low) & (found[:, 1] < high)][:PARTICLES]
         self._count = len(found)
         if self._count:
-            self._tracker = PointTracker(found, TrackOptions(subset_px=15, model="neighbours"))
+            alone = TrackOptions(subset_px=15, model="affine")
+            try:
+                self._tracker = PointTracker(found, replace(alone, model="neighbours"))
+            except InputError:  # fewer than six particles, or all on one line
+                self._tracker = PointTracker(found, alone)
             self._state = self._tracker.init(list(images))
 
     def follow(self, frames: Frames, mass_kg: float) -> None:
@@ -111,6 +115,18 @@ class _Particles:
             for field in ("x_px", "y_px", "std_x_px", "std_y_px", "valid"):
                 row[field][: self._count] = getattr(found, field)
         self._session.append_frames(self._name, frames.time_s[list(chosen)], rows, mass_kg)
+
+
+def _count_at_rest(images: NDArray[np.uint8], points: NDArray[np.float64]) -> int:
+    """Number of frames before the first motion of the points, which would blur the mean."""
+    tracker = PointTracker(points, _OPTIONS)
+    state = tracker.init([images[0]])
+    for count, image in enumerate(images[1:], start=1):
+        state, found = tracker.step(state, image)
+        moved_px = np.hypot(found.x_px - points[:, 0], found.y_px - points[:, 1])
+        if not found.valid.all() or moved_px.max() > _STILL_PX:
+            return count
+    return len(images)
 
 
 class CameraRecorder:
@@ -197,35 +213,35 @@ class CameraRecorder:
 
     def _place(self, images: NDArray[np.uint8]) -> None:
         """Find the fiducials; in the session's first frames, also make them the reference."""
+        first = images[:_REST_FRAMES]
         if self._tracker is None:
-            rest = images[: self._frames_at_rest(images[:_REST_FRAMES])]
+            rest = self._at_rest(first)
             points = self._call(_fiducials_of, rest)
             self._tracker = PointTracker(points, _OPTIONS)
             self._state = self._tracker.init(list(rest))
         else:
-            points = self._find(images[0])
+            points, rest = self._find(images[0]), None
         assert self._state is not None
         self._state = self._tracker.placed(self._state, points)
         self._points = points
         self._placed = True
         if self._particles is not None:
-            self._particles.refer(images[:_REST_FRAMES], points)
+            still = first[: _count_at_rest(first, points)] if rest is None else rest
+            self._particles.refer(still, points)
             write_png(self._folder / f"{self._name}.png", images[0])
 
-    def _frames_at_rest(self, images: NDArray[np.uint8]) -> int:
-        """Number of frames before the first motion, which would blur their mean."""
+    def _at_rest(self, images: NDArray[np.uint8]) -> NDArray[np.uint8]:
+        """The frames before the first motion; fewer than all are noted in the session."""
         try:
             points = self._call(_fiducials_of, images[:1])
         except ResultError:  # too noisy; the mean of all frames may be good enough
-            return len(images)
-        tracker = PointTracker(points, _OPTIONS)
-        state = tracker.init([images[0]])
-        for count, image in enumerate(images[1:], start=1):
-            state, found = tracker.step(state, image)
-            moved_px = np.hypot(found.x_px - points[:, 0], found.y_px - points[:, 1])
-            if not found.valid.all() or moved_px.max() > _STILL_PX:
-                return count
-        return len(images)
+            return images
+        count = _count_at_rest(images, points)
+        if count < len(images):
+            self._session.event(
+                self._last_s, f"camera: motion after {count} frames, which are the reference"
+            )
+        return images[:count]
 
     def _find(self, image: NDArray[np.uint8]) -> NDArray[np.float64]:
         """Find the fiducials, near their last positions first, then in the whole image."""

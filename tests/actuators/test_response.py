@@ -152,6 +152,7 @@ def test_a_part_of_the_columns_that_starts_late_is_waited_for(monkeypatch):
     law, drive, times_s = LAWS["planar"], drive_of(), np.linspace(0.0, 4.0, 50)
     sampled, start = SampledLaw(law, 15e3, BY["planar"]), start_of(law, 1.2)
     monkeypatch.setattr("haselab.actuators.response._CORES", 2)
+    monkeypatch.setattr("haselab.actuators.response._COLUMNS_EACH", 4)
 
     def late(job, items, most):
         """One thread, which pauses after each part."""

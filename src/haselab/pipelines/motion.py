@@ -77,18 +77,21 @@ def motion_of_session(
     Raises:
         InputError: The session has no conditions, no rig, or neither lengths nor capacitances.
     """
-    return motions_of_session(reader, path, (lockin,))[0]
+    return motions_of_session(reader, path, [(lockin, {})])[0]
 
 
 def motions_of_session(
-    reader: SessionReader, path: Path, lockins: Sequence[Lockin | None]
+    reader: SessionReader,
+    path: Path,
+    lockins: Sequence[tuple[Lockin | None, Mapping[str, Sensed]]],
 ) -> list[MotionRecord]:
     """The same motion with the capacitances of several lock-ins; the session is read once.
 
     Args:
         reader: of the session, open.
         path: of the session, for messages.
-        lockins: see `motion_of_session`.
+        lockins: see `motion_of_session`; each with what it has sensed before, by the recording's
+            name.
     Returns:
         One motion for each.
     Raises:
@@ -182,20 +185,31 @@ def _windows(drive: Drive, blocks: _Blocks) -> tuple[NDArray[np.int64], NDArray[
 
 
 def _sensed(
-    reader: SessionReader, record: ExperimentRecord, path: Path, lockins: Sequence[Lockin | None]
+    reader: SessionReader,
+    record: ExperimentRecord,
+    path: Path,
+    lockins: Sequence[tuple[Lockin | None, Mapping[str, Sensed]]],
 ) -> list[_Blocks]:
     config = session_config(reader, record.codes.shape[1], DEFAULT_REQUEST, path)
     whole = Lockin(config)  # knows when the output is updated
     rise = _rise(record.codes[:, :, 0], whole)
-    return [_blocks(reader, record, lockin or whole, rise) for lockin in lockins]
+    return [
+        _blocks(reader, record, lockin or whole, rise, before.get(record.name))
+        for lockin, before in lockins
+    ]
 
 
 def _blocks(
-    reader: SessionReader, record: ExperimentRecord, lockin: Lockin, rise: _Rise
+    reader: SessionReader,
+    record: ExperimentRecord,
+    lockin: Lockin,
+    rise: _Rise,
+    sensed: Sensed | None,
 ) -> _Blocks:
     rig, config = reader.header["rig"], lockin.config
     block_s = config.block_samples / config.rate_hz
-    sensed = lockin.sense(record.codes)
+    if sensed is None:
+        sensed = lockin.sense(record.codes)
     middle_s = sensed.time_s - block_s * np.arange(len(record.codes))
     # other models than the plain one use other samples
     plain = np.abs(middle_s - lockin.middle_s) < 0.5 / config.rate_hz

@@ -2,6 +2,7 @@
 
 import hashlib
 import json
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -12,10 +13,12 @@ from haselab.cli.actuator_file import load_actuator
 from haselab.cli.identify.recorded_motion import TableOptions, motion_of_file
 from haselab.cli.main import main
 from haselab.identify.physical import ActuatorFit
-from haselab.pipelines.motion import motion_of_session
+from haselab.pipelines.motion import motion_of_session, motions_of_session
 from haselab.rig.twin.twin_file import load_twin
+from haselab.runtime.lockin import lockin_of
 from haselab.store.columns.selection import ColumnOptions
 from haselab.store.session.reader import SessionReader
+from haselab.study.run import described
 from tests.cli.model.physical_files import (
     CAPACITANCE_STD_F,
     GAIN,
@@ -88,6 +91,24 @@ def test_the_voltage_monitor_shows_a_wrong_gain_of_the_amplifier(session):
     # a level is known to a code, 1.5 V, of steps of 1.5 kV and more
     assert right.voltage_ratio == pytest.approx(1.0, abs=1e-3)
     assert wrong.voltage_ratio == pytest.approx(right.voltage_ratio / 1.1)
+
+
+@pytest.mark.long
+def test_what_a_lockin_has_sensed_before_is_not_sensed_again(session):
+    """Sensed capacitances of twice the size show that they are used; all else is the same."""
+    with SessionReader(session) as reader:
+        rig = described(reader.header["rig"])
+        lockin = lockin_of(rig, 2000.0)
+        sensed = {name: lockin.sense(reader.experiment(name).codes) for name in reader.names}
+        twice = {
+            name: replace(one, capacitance_f=2.0 * one.capacitance_f)
+            for name, one in sensed.items()
+        }
+        lockins = [(lockin, known) for known in ({}, sensed, twice)]
+        anew, same, other = motions_of_session(reader, session, lockins)
+    np.testing.assert_array_equal(same.capacitance_f, anew.capacitance_f)
+    np.testing.assert_array_equal(same.drive.edge_s, anew.drive.edge_s)
+    np.testing.assert_array_equal(other.capacitance_f, 2.0 * anew.capacitance_f)
 
 
 @pytest.mark.long

@@ -43,6 +43,20 @@ def test_a_fit_without_a_result_nearby_changes_nothing():
     assert again.parameters == found.parameters
 
 
+def test_outputs_that_the_fit_nearby_excludes_are_excluded_again():
+    rng = np.random.default_rng(8)
+    u = np.repeat(rng.choice([-1.0, 1.0], size=200), 20)
+    y = Plant(0.6, 9.0, 0.1, 0.02).simulate(u, 200.0, np.arange(u.size) / 200.0)
+    y = np.clip(y, -9.0, 0.5) + 0.01 * rng.normal(size=u.size)
+    near = fit_transfer(Record.sampled(u, y, 200.0), applied=True)
+    changed = Record.sampled(u, y + 0.01 * _CHANGE * rng.normal(size=u.size), 200.0)
+    again = fit_transfer(changed, applied=True, near=near)
+    for fit in (near, again):
+        assert fit.status == "ok"
+        assert any("clipped at" in note for note in fit.notes)
+        assert fit.records[0].y.size < u.size
+
+
 def test_a_free_response_from_nearby_is_that_of_the_search():
     """As above, with 1e-10 of the cost."""
     rng = np.random.default_rng(7)

@@ -102,7 +102,9 @@ def identify_physical_model(
         header = reader.header
         rig = described(header["rig"])
         lockin = lockin_of(rig, study.sensing.carrier_hz)  # as the study senses
-        record, observed = motions_of_session(reader, session_file(session), (None, lockin))
+        sensed = {k: o.sensed for k, o in found.observations.items() if o.sensed is not None}
+        lockins = [(None, {}), (lockin, sensed)]
+        record, observed = motions_of_session(reader, session_file(session), lockins)
         start = ACTUATORS.find(rig.actuator_kind)()
         fit = fit_actuator(start, [record], mass_kg=float(record.drive.mass_kg[0]))
         if fit.status != "ok":

@@ -298,8 +298,9 @@ def fit_transfer(
         applied: whether the inputs are known to have been applied as recorded, by the same clock:
             a clipped or slew-limited input and a drifting clock are then not considered as causes.
         near: fit of the same structure to almost the same records: the search starts there alone,
-            ends nearer to the minimum, and looks for no other. None, or one without a result: no
-            such fit is known.
+            ends nearer to the minimum, and looks for no other. If that fit excludes no output
+            and `applied` is true, no spikes and clipped outputs are looked for. None, or one
+            without a result: no such fit is known.
     Returns:
         The fit; `status` says "ok" or why there is no result.
     Raises:
@@ -345,8 +346,7 @@ def _fitted(
     tones = _too_few_tones(layout_of(structure), records)
     if tones is not None:
         return _no_result(layout_of(structure), tones)
-    known = [] if near is None or near.best is None else [near.best.found.search]
-    fit = _fit(layout_of(structure), records, applied=applied, known=known)
+    fit = _fit(layout_of(structure), records, applied=applied, near=near)
     if _doubtful(fit):
         why = _why(structure, records)
         fit = fit if why is None else replace(fit, status=why, ambiguous=False)
@@ -384,10 +384,11 @@ def _too_few_tones(layout: Layout, records: Sequence[Record]) -> str | None:
 
 
 def _fit(
-    layout: Layout, records: Sequence[Record], *, applied: bool, known: Sequence[Floats] = ()
+    layout: Layout, records: Sequence[Record], *, applied: bool, near: TransferFit | None = None
 ) -> TransferFit:
-    """Search the parameters, from known ones if there are any, then describe the result."""
+    """Search the parameters, from a near fit if there is one, then describe the result."""
     _check_size(layout, records)
+    known = [] if near is None or near.best is None else [near.best.found.search]
     tried: list[Best] = []
     for variant in _variants(records):
         found_before = [one.search for best in tried for one in (best.found, *best.others[:2])]
@@ -396,11 +397,19 @@ def _fit(
         tried += [] if search is None else [search]
     if not tried:
         return _no_result(layout, "no stable model found; record longer, or fit fewer poles")
-    found = diagnose(layout, min(tried, key=lambda entry: entry.found.cost), applied=applied)
+    best = min(tried, key=lambda entry: entry.found.cost)
+    if applied and near is not None and near.succeeded and _count(near.records) == _count(records):
+        return _describe(layout, best)  # almost the same records have no output to exclude
+    found = diagnose(layout, best, applied=applied)
     fit = _describe(layout, found.best)
     if found.fault is not None:
         fit = replace(fit, status=found.fault, ambiguous=False)
     return replace(fit, notes=(*fit.notes, *found.notes))
+
+
+def _count(records: Sequence[Record]) -> int:
+    """Number of outputs."""
+    return sum(record.y.size for record in records)
 
 
 def _is_fed_back(fit: TransferFit) -> bool:
@@ -445,7 +454,7 @@ def _check_size(layout: Layout, records: Sequence[Record]) -> None:
             f"There are {len(records)} records; at most {_MOST_RECORDS} are possible. "
             "Fit groups of records and compare the results, or leave some out."
         )
-    count = sum(record.y.size for record in records)
+    count = _count(records)
     own = layout.structure.offset + sum(s.order for s in layout.sections)
     wanted = layout.free.size + len(layout.factor_names) + own * len(records)
     if count < 2 * wanted:

@@ -116,21 +116,29 @@ def at_a_rail(cut: Floats, used: NDArray[np.bool_]) -> NDArray[np.bool_]:
         >>> at_a_rail(np.concatenate([cut, cut[:, [1, 1]]]), np.ones((2, 20), dtype=bool)).tolist()
         [True, False]
     """
-    piled = np.zeros(len(cut), dtype=np.bool_)
+    flat = cut.reshape(len(cut), 2, -1)
     every = np.repeat(used, cut.shape[3], axis=1)[:, np.newaxis]
-    for sign in (1.0, -1.0):
-        values = sign * cut.reshape(len(cut), 2, -1)
-        below = values.max(axis=2, keepdims=True) - values
-        top = below == 0.0
-        inside = np.where(top, np.inf, below)
-        step = inside.min(axis=2, keepdims=True)
-        width = np.maximum(_JUST_INSIDE[0] * step, _JUST_INSIDE[1] * below.max(2, keepdims=True))
-        ends = [top[..., k : top.shape[2] - _RUN + 1 + k] for k in range(_RUN)]
-        runs = np.logical_and.reduce(ends)
-        inner = np.zeros_like(top)
-        for k in range(_RUN):
-            inner[..., k : top.shape[2] - _RUN + 1 + k] |= runs
-        many = (inner & every).sum(axis=2)
-        near = ((inside <= width) & every).sum(axis=2)
-        piled |= ((many >= _FEWEST) & (many > _PILED * near)).any(axis=1)
+    piled = np.zeros(len(cut), dtype=np.bool_)
+    for sign, ends in ((1.0, flat.max(axis=2)), (-1.0, flat.min(axis=2))):
+        # most blocks have fewer such readings, in runs or not
+        equal = np.count_nonzero(flat == ends[:, :, np.newaxis], axis=2)
+        some = np.flatnonzero((equal >= _FEWEST).any(axis=1))
+        piled[some] |= _piled_at_top(sign * flat[some], every[some])
     return piled
+
+
+def _piled_at_top(values: Floats, every: NDArray[np.bool_]) -> NDArray[np.bool_]:
+    """Whether more readings equal the largest one of a block, in runs, than lie just below."""
+    below = values.max(axis=2, keepdims=True) - values
+    top = below == 0.0
+    inside = np.where(top, np.inf, below)
+    step = inside.min(axis=2, keepdims=True)
+    width = np.maximum(_JUST_INSIDE[0] * step, _JUST_INSIDE[1] * below.max(2, keepdims=True))
+    ends = [top[..., k : top.shape[2] - _RUN + 1 + k] for k in range(_RUN)]
+    runs = np.logical_and.reduce(ends)
+    inner = np.zeros_like(top)
+    for k in range(_RUN):
+        inner[..., k : top.shape[2] - _RUN + 1 + k] |= runs
+    many = (inner & every).sum(axis=2)
+    near = ((inside <= width) & every).sum(axis=2)
+    return np.asarray(((many >= _FEWEST) & (many > _PILED * near)).any(axis=1))

@@ -12,7 +12,7 @@ from haselab.base import JsonObject
 from haselab.rig import RigDescription
 from haselab.runtime.lockin import printed_chain_of
 from haselab.runtime.observer import FIDUCIALS
-from haselab.sensing import Lockin, step_latencies
+from haselab.sensing import Lockin, Sensed, step_latencies
 from haselab.store.session.writer import ExperimentRecord
 from haselab.study.fits.paper_chain import Chain, read_chain
 from haselab.study.tables import Sensing
@@ -46,6 +46,7 @@ class Observation:
             drive, shape `(n,)`.
         lockin: values of the lock-in for each block.
         printed: values of the paper's sensing chain; None if they are not needed.
+        sensed: what the lock-in found; None if it did not sense recorded blocks.
     """
 
     name: str
@@ -64,6 +65,7 @@ class Observation:
     latency_s: NDArray[np.float64]
     lockin: Chain | None = None
     printed: Chain | None = None
+    sensed: Sensed | None = None
 
 
 # Returns the observation with a name; an analysis has no other access to the session.
@@ -113,7 +115,7 @@ def observe(
     good = np.isfinite(length_m)
     drops = [time for time, what in events if what == f"drop {record.name}"]
     capacitance_f = relative = times_s = np.empty(0)
-    by_lockin = by_chain = None
+    sensed = by_lockin = by_chain = None
     if len(record.codes):
         sensed = lockin.sense(record.codes)
         # A block with its own model uses other samples, so its middle differs.
@@ -141,6 +143,7 @@ def observe(
         latency_s=_latencies(record, rig),
         lockin=by_lockin,
         printed=by_chain,
+        sensed=sensed,
     )
 
 

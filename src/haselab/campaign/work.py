@@ -6,7 +6,7 @@ import re
 import time
 import traceback
 import warnings
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping
 from typing import Any
 
 import numpy as np
@@ -24,7 +24,7 @@ _ADDRESS = re.compile(r"0x[0-9a-f]{6,}")  # differs between processes
 _MOST_CHARACTERS = 500
 
 
-def compute_cases(problem: Problem, jobs: Sequence[Job]) -> list[CaseRow]:
+def compute_cases(problem: Problem, jobs: Iterable[Job]) -> list[CaseRow]:
     """Compute some cases, one after the other.
 
     Args:

@@ -91,10 +91,10 @@ def command(
 
     def executor(problem: Problem, waiting: int) -> Executor:
         if scheduler is None:
-            return ProcessExecutor(problem, min(count, waiting))
+            return ProcessExecutor(problem, min(count, waiting), plan.campaign.time_limit_s)
         from haselab.campaign.executors.dask import DaskExecutor  # an optional package
 
-        return DaskExecutor(problem, scheduler, count)
+        return DaskExecutor(problem, scheduler, count, plan.campaign.time_limit_s)
 
     progress = Interruptible(progress_bar())
     found = run_cases(plan, out, executor, progress, retry_failed=retry_failed)

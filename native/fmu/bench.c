@@ -144,8 +144,8 @@ static fmu_status check_inputs(fmu_bench *b)
     }
     if (!(in[FMU_CARRIER_V] >= 0.0 && in[FMU_CARRIER_V] <= 1.0 && in[FMU_CARRIER_HZ] > 0.0 &&
           in[FMU_CARRIER_HZ] < nyquist_hz)) {
-        return fmu_fail(b, "The carrier is %g V at %g Hz, but it must be within 0 to 1 V and below %g "
-                       "Hz. Correct carrier_v or carrier_hz.",
+        return fmu_fail(b, "The carrier is %g V at %g Hz, but it must be within 0 to 1 V, and between 0 "
+                       "and %g Hz. Correct carrier_v or carrier_hz.",
                     in[FMU_CARRIER_V], in[FMU_CARRIER_HZ], nyquist_hz);
     }
     if (!isfinite(in[FMU_FORCE_N])) {
@@ -195,6 +195,11 @@ static void set_drive(fmu_bench *b)
     }
 }
 
+void fmu_terminate(fmu_bench *b)
+{
+    b->now->terminated = 1;
+}
+
 fmu_status fmu_step(fmu_bench *b, double time_s, double step_s)
 {
     fmu_memory *m = b->now;
@@ -204,6 +209,10 @@ fmu_status fmu_step(fmu_bench *b, double time_s, double step_s)
     int64_t from, until;
     if (!m->initialised) {
         return fmu_fail(b, "A step was made before the initialisation. Initialise the FMU first.");
+    }
+    if (m->terminated) {
+        return fmu_fail(b, "A step was made after the simulation was terminated. Reset it first, or "
+                       "restore an earlier state.");
     }
     if (m->failed) {
         return fmu_fail(b, "An earlier step failed. Reset the simulation, or restore an earlier state.");

@@ -139,7 +139,7 @@ FMI_EXPORT int fmi2ExitInitializationMode(void *f)
 
 FMI_EXPORT int fmi2Terminate(void *f)
 {
-    (void)f;
+    fmu_terminate(((instance *)f)->bench);
     return FMU_OK;
 }
 

@@ -116,7 +116,7 @@ FMI_EXPORT int fmi3ExitInitializationMode(void *f)
 
 FMI_EXPORT int fmi3Terminate(void *f)
 {
-    (void)f;
+    fmu_terminate(((instance *)f)->bench);
     return FMU_OK;
 }
 

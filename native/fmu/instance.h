@@ -18,9 +18,12 @@ typedef struct {
     double clamp_kg, moving_kg, settle_s, gravity_m_s2;
 } fmu_header;
 
+#define FMU_NAME 56 /* bytes of a name, with the zero at its end */
+
 typedef struct {
     int64_t place;
-    double start, low, high;
+    double start, low, high; /* a smallest positive `low`: more than 0 */
+    char name[FMU_NAME];
 } fmu_record;
 
 typedef struct {
@@ -41,7 +44,7 @@ struct fmu_memory {
     int32_t pending, first_pending;
     fmu_change queue[FMU_PENDING];
     double sensed_f, sensed_ohm, v_reading_v, i_reading_v;
-    int32_t sensed_valid, initialised;
+    int32_t sensed_valid, initialised, terminated, unused;
     double parameter[]; /* then the last readings of both monitors: floats of a block each */
 };
 

@@ -60,7 +60,7 @@ static int load(fmu_bench *b, size_t size)
         return 0;
     }
     memcpy(&b->about, b->file, at);
-    if (memcmp(h->magic, "HASELFMU", 8) != 0 || h->version != 1u ||
+    if (memcmp(h->magic, "HASELFMU", 8) != 0 || h->version != 2u ||
         h->bytes_of_parameters != sizeof(twin_parameters) ||
         h->bytes_of_state != sizeof(twin_state) || h->block_samples < TWIN_SUB ||
         h->block_samples > 65520 || h->block_samples % TWIN_SUB != 0 || h->parameters > 1000u ||

@@ -79,16 +79,17 @@ fmu_status fmu_set_real(fmu_bench *b, uint32_t reference, double value)
         return fmu_no_such(b, reference, "real input or parameter");
     }
     if (!isfinite(value)) {
-        return fmu_fail(b, "The parameter with value reference %u is %g. Set a finite number.",
-                        (unsigned)reference, value);
+        return fmu_fail(b, "%s is %g. Set a finite number.", b->records[k].name, value);
     }
     if (!(value >= b->records[k].low && value <= b->records[k].high)) {
-        return fmu_fail(b, "The parameter with value reference %u is %g. Set it within %g to %g.",
-                        (unsigned)reference, value, b->records[k].low, b->records[k].high);
+        const int positive = b->records[k].low > 0.0 && b->records[k].low < 1e-300;
+        return fmu_fail(b, "%s is %g. Set it %s %g%s%g.", b->records[k].name, value,
+                        positive ? "above" : "within", positive ? 0.0 : b->records[k].low,
+                        positive ? ", at most " : " to ", b->records[k].high);
     }
     if (b->now->initialised) {
-        return fmu_fail(b, "A parameter was set during the simulation. Set it before the "
-                       "initialisation ends.");
+        return fmu_fail(b, "%s was set during the simulation. Set it before the initialisation ends.",
+                        b->records[k].name);
     }
     b->now->parameter[k] = value;
     b->now->settled = 0;

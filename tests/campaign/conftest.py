@@ -69,6 +69,9 @@ class InThisProcess:
             return [Outcome(chunk, None)]
         return [Outcome(chunk, compute_cases(self._problem, chunk.jobs))]
 
+    def longest(self) -> None:
+        pass
+
     def close(self) -> None:
         self._chunks.clear()
 

@@ -250,6 +250,7 @@ def test_a_damaged_shard_is_named(campaigns: Any, begin: int) -> None:
         ({"case.gain": 5.0}, "cannot have the result 'case.gain'"),
         ({"a": Estimate.normal(1.0, 0.1, ""), "a.low": 0.0}, "cannot have the result 'a.low'"),
         ({"": 5.0}, "a result has no name"),
+        ({"a": "7"}, "the result 'a' is the text '7', not a number"),
         ({"a\udcff": 5.0}, "surrogates not allowed"),
         (RuntimeError("no file \udcff"), r"no file \udcff"),
     ],

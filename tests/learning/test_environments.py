@@ -1,5 +1,7 @@
 """The environments: by Gymnasium's own rules, and against the closed loop of the scoreboard."""
 
+import copy
+import pickle
 from dataclasses import replace
 
 import gymnasium
@@ -171,7 +173,8 @@ def test_bad_arguments_are_refused_in_one_line(options: dict[str, object], messa
 @pytest.mark.parametrize(
     ("action", "message"),
     [
-        (np.array([np.nan]), "An action is NaN"),
+        (np.array([np.nan]), "An action is nan"),
+        (np.array([-np.inf]), "An action is -inf"),
         (np.zeros(2), r"an array of shape \(2,\).*State 1 number"),
         (None, "The action is None"),
     ],
@@ -207,9 +210,52 @@ def test_seeds_of_numpy_are_seeds_and_none_is_random() -> None:
 
     assert first(np.int64(5)) == first(5)
     assert first([None, None]) != first([None, None])
+    assert first(np.array(5)) == first(np.array([5])) == first([5])
+    single = StrainEnv("track", devices=1)
+    assert single.reset(seed=np.int64(5))[0].tolist() == single.reset(seed=5)[0].tolist()
+    for wrong in (-1, 1.5, True, "1"):
+        with pytest.raises(InputError, match="The seed is"):
+            single.reset(seed=wrong)  # type: ignore[arg-type]
     for wrong in (-1, 1.5, True, [1, "a"]):
         with pytest.raises(InputError, match="The seed is"):
             first(wrong)
+    with pytest.raises(InputError, match="The options are 5"):
+        envs.reset(options=5)
+
+
+@pytest.mark.parametrize("shape", [(1, 4), (2, 2), (4, 2), (5,)])
+def test_actions_of_another_shape_are_refused(shape: tuple[int, ...]) -> None:
+    envs = StrainVectorEnv(4, "track", devices=1)
+    envs.reset(seed=1)
+    with pytest.raises(InputError, match="State 4 numbers from -1 to 1"):
+        envs.step(np.zeros(shape, np.float32))
+    assert envs.step(np.zeros(4, np.float32))[0].shape == (4, 6)
+
+
+def test_copies_and_pictures_of_many_are_refused_with_the_remedy() -> None:
+    env = StrainEnv("track", devices=1)
+    for copied in (copy.deepcopy, pickle.dumps):
+        for one in (env, StrainVectorEnv(2, "track", devices=1)):
+            with pytest.raises(TypeError, match="Give each process a function that makes one"):
+                copied(one)
+    with pytest.raises(InputError, match="Leave out render_mode"):
+        StrainVectorEnv(2, "track", devices=1, render_mode="rgb_array")
+
+
+def test_two_processes_play_the_episodes_of_this_one() -> None:
+    """With spawn, as on every system; the two environments have the seeds 5 and 6."""
+    envs = gymnasium.make_vec(
+        "haselab.learning:haselab/Hold-v0", 2, vectorization_mode="async", devices=1,
+        vector_kwargs={"context": "spawn"},
+    )  # fmt: skip
+    try:
+        found = [envs.reset(seed=5)[0], envs.step(np.full((2, 1), 0.5, np.float32))[0]]
+    finally:
+        envs.close()
+    for k in range(2):
+        env = StrainEnv("hold", devices=1)
+        np.testing.assert_array_equal(found[0][k], env.reset(seed=5 + k)[0])
+        np.testing.assert_array_equal(found[1][k], env.step(np.full(1, 0.5, np.float32))[0])
 
 
 def test_the_mask_of_a_reset_says_which_episodes_begin() -> None:

@@ -49,6 +49,9 @@ class _File(Section):
     base: dict[str, str] = Field({}, description="files that the cases start from, or built-in")
     case: dict[str, Any] = Field({}, description="settings of the kind")
     parameters: dict[str, Any] = Field({}, description="axes and distributions")
+    time_limit_s: float | None = Field(
+        None, gt=0, le=1e7, description="of a case, which fails if it takes longer; default: none"
+    )
     design: Design = Design()
 
 
@@ -92,6 +95,8 @@ class Campaign:
         axes: fully crossed.
         distributions: drawn by the design.
         design: of the points.
+        time_limit_s: of a case; None: there is none. It does not belong to what a case is, so that
+            it can be changed before failed cases are computed again.
     """
 
     name: str
@@ -101,6 +106,7 @@ class Campaign:
     axes: tuple[Axis, ...]
     distributions: tuple[Distribution, ...]
     design: Design
+    time_limit_s: float | None = None
 
     @property
     def paths(self) -> tuple[str, ...]:
@@ -127,7 +133,7 @@ class Campaign:
         return axes * self.points * self.design.repeats
 
     def described(self) -> JsonObject:
-        """All that determines the results, as JSON types."""
+        """All that determines the results but the time limit, as JSON types."""
         return {
             "name": self.name,
             "kind": self.kind,
@@ -174,7 +180,7 @@ def _checked(file: _File, path: Path) -> Campaign:
     for key in _paths(axes, distributions):
         _refuse_unknown(key, tables)
     found = Campaign(
-        file.name, file.kind, file.seed, tables, axes, distributions, file.design
+        file.name, file.kind, file.seed, tables, axes, distributions, file.design, file.time_limit_s
     )  # fmt: skip
     _check_design(found)
     kind.check(Inputs(tables))

@@ -29,6 +29,7 @@ _AHEAD = 2  # chunks for each worker: one in work and one that waits
 _BLOCKS = 1000  # into which the cases are divided for claims
 _MOST_DEATHS = 4  # of workers that computed the same case
 _WAIT_S = 1.0
+_LONG_S, _LONG = 30.0, 10.0  # a case that is mentioned: its time, and that over the mean one
 
 
 @dataclass(frozen=True)
@@ -133,24 +134,33 @@ class _Run:
         waiting = sum(map(len, self._left.values()))
         self._progress.start(float(waiting))
         workers = 1
+        running: tuple[Job, float] | None = None
         try:
             if waiting:
                 executor = make(self._plan.problem, waiting)
                 try:
                     self._work(executor)
                 finally:
+                    running = executor.longest()
                     workers = executor.workers
                     executor.close()
         except (DeviceError, KeyboardInterrupt) as stop:
-            raise self._explained(stop) from None
+            raise self._explained(stop, running) from None
         finally:
             self._progress.stop()
         return self._result(workers, time.monotonic() - begun)
 
-    def _explained(self, stop: DeviceError | KeyboardInterrupt) -> BaseException:
-        """The error with what is kept."""
+    def _explained(
+        self, stop: DeviceError | KeyboardInterrupt, running: tuple[Job, float] | None
+    ) -> BaseException:
+        """The error with what is kept, and with a case that may never end."""
         done = f"{self._finished():,} of {self._plan.count:,} cases are finished and kept"
         note = f"{done}; the same command continues."
+        if running is not None and running[1] > max(_LONG_S, _LONG * self._each_s):
+            note += (
+                f" Case {running[0].index} had been running for {running[1]:.0f} s; if cases may "
+                "never end, set time_limit_s in the campaign file."
+            )
         if isinstance(stop, KeyboardInterrupt):
             stop.add_note(note)
             return stop
@@ -225,9 +235,15 @@ class _Run:
         return self._plan.job(index, self._hashes[index], attempt)
 
     def _take(self, outcome: Outcome) -> None:
-        """Write the rows of a chunk, or queue its cases again."""
+        """Write the rows of a chunk, and queue the cases without one again."""
         if outcome.rows is None:
             self._again(outcome)
+            return
+        computed = {row.index for row in outcome.rows}
+        self._queue.extendleft(
+            job for job in reversed(outcome.chunk.jobs) if job.index not in computed
+        )
+        if not outcome.rows:
             return
         self._write(outcome.rows)
         mean_s = sum(row.compute_s for row in outcome.rows) / len(outcome.rows)

@@ -6,12 +6,12 @@ import re
 import time
 import traceback
 import warnings
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping
 from typing import Any
 
 import numpy as np
 
-from haselab.base import DeviceError, Estimate, Json, described
+from haselab.base import DeviceError, Estimate, Json, described, shown
 from haselab.base.exits import no_exit
 from haselab.campaign.definition import with_values
 from haselab.campaign.kinds.case_kind import CASE_KINDS, Inputs
@@ -24,7 +24,7 @@ _ADDRESS = re.compile(r"0x[0-9a-f]{6,}")  # differs between processes
 _MOST_CHARACTERS = 500
 
 
-def compute_cases(problem: Problem, jobs: Sequence[Job]) -> list[CaseRow]:
+def compute_cases(problem: Problem, jobs: Iterable[Job]) -> list[CaseRow]:
     """Compute some cases, one after the other.
 
     Args:
@@ -100,4 +100,6 @@ def _columns(name: str, value: Any) -> dict[str, Json]:
             name: float(value.value), f"{name}.std": float(value.std),
             f"{name}.low": float(low), f"{name}.high": float(high),
         }  # fmt: skip
+    if isinstance(value, (str, bytes)):  # float() would read a number in it
+        raise TypeError(f"the result {name!r} is the text {shown(value)}, not a number")
     return {name: float(value)}

@@ -10,7 +10,12 @@ from gymnasium import spaces
 from numpy.typing import NDArray
 
 from haselab.base import InputError, JsonObject, shown
-from haselab.learning.simulation import LARGEST_OBSERVATION, OBSERVATIONS, StrainSimulation
+from haselab.learning.simulation import (
+    LARGEST_OBSERVATION,
+    OBSERVATIONS,
+    StrainSimulation,
+    whole_number,
+)
 from haselab.rig.twin.camera import TwinCamera
 from haselab.scoreboard.devices import find_device
 
@@ -37,7 +42,10 @@ def actions_of(action: object, count: int) -> NDArray[np.float64]:
         InputError: They are not numbers, or not as many.
     """
     found = np.asarray(action)
-    if found.dtype.kind not in "iuf" or found.size != count:
+    # one number may have any shape; of several, another shape is a mistake of the caller
+    shapes = [(count,), (count, 1)]
+    alright = found.size == count and (count == 1 or found.shape in shapes)
+    if found.dtype.kind not in "iuf" or not alright:
         raise InputError(
             f"The action is {shown(action)}. State {count} "
             f"{'number' if count == 1 else 'numbers'} from -1 to 1."
@@ -82,7 +90,17 @@ class StrainEnv(gymnasium.Env[NDArray[np.float32], NDArray[np.float32]]):
     def reset(
         self, *, seed: int | None = None, options: JsonObject | None = None
     ) -> tuple[NDArray[np.float32], JsonObject]:
-        """Begin an episode, see `gymnasium.Env.reset`."""
+        """Begin an episode, see `gymnasium.Env.reset`.
+
+        Args:
+            seed: of this episode and the next ones; None: they continue.
+            options: none are known.
+        Raises:
+            InputError: The seed is not a whole number of 0 or more.
+        """
+        if seed is not None:
+            whole_number("The seed", seed, 0, 2**63 - 1)
+            seed = int(seed)  # Gymnasium refuses integers of numpy
         super().reset(seed=seed)
         self._simulation.reset(np.zeros(1, dtype=np.int64), self.np_random)
         self._ended = False

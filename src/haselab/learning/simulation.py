@@ -117,6 +117,18 @@ class StrainSimulation:
         self._map_strain = lengths / ZERO_LENGTH_M - 1.0
         self._reach = _reach(self._pool)
 
+    def __reduce__(self) -> tuple[object, ...]:
+        """Refuse to be copied or pickled in words that name the remedy.
+
+        Raises:
+            TypeError: always.
+        """
+        raise TypeError(
+            "An environment of haselab cannot be copied or pickled: its twins are in compiled "
+            "code. Give each process a function that makes one, such as "
+            "lambda: gymnasium.make('haselab.learning:haselab/Track-v0')."
+        )
+
     @property
     def period_s(self) -> float:
         """Time between two actions, in s."""
@@ -189,11 +201,15 @@ class StrainSimulation:
         Returns:
             Rewards; whether a device no longer works; whether the episode is at its end.
         Raises:
-            InputError: An action is NaN, or an episode has not begun or is over.
+            InputError: An action is not finite, or an episode has not begun or is over.
         """
         pool, drive = self._pool, self._drive_v
-        if np.isnan(actions).any():
-            raise InputError("An action is NaN. Actions are numbers from -1 to 1.")
+        if not np.isfinite(actions).all():
+            wrong = actions[~np.isfinite(actions)][0]
+            raise InputError(
+                f"An action is {wrong:g}. Actions are numbers from -1 to 1. Has the policy "
+                "diverged?"
+            )
         if not self._begun.all():
             raise InputError("The episode has not begun. Call reset() before step().")
         if (self._update > self._updates).any():

@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from haselab.base import InputError
+from haselab.base import InputError, shown
 from haselab.controllers.network.controller import STRAIN_PER_ONE
 from haselab.controllers.network.weights import (
     FEATURES,
@@ -213,6 +213,8 @@ def train(
     tasks = (tasks,) if isinstance(tasks, str) else tuple(tasks)
     if not tasks:
         raise InputError("No tasks are given. State at least one.")
+    if not (start is None or isinstance(start, Network)):
+        raise InputError(f"start is {shown(start)}. State a Network; Network.load reads a file.")
     whole_number("seed", seed, 0, 2**32 - 2)
     whole_number("generations", generations, 1, _MOST)
     whole_number("population", population, 2, _MOST)

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from typing import Any
 
 import numpy as np
@@ -42,7 +42,10 @@ class StrainVectorEnv(VectorEnv[Observed, Observed, Any]):
     metadata = {"autoreset_mode": AutoresetMode.NEXT_STEP}  # noqa: RUF012
 
     def __init__(self, num_envs: int = 1, task: str = "track", **options: Any) -> None:
-        options.pop("render_mode", None)
+        if options.pop("render_mode", None) is not None:  # `make_vec` passes it on
+            raise InputError(
+                "The vector form shows no pictures. Leave out render_mode, or use StrainEnv."
+            )
         self._simulation = StrainSimulation(task, num_envs, **options)
         self.num_envs = num_envs
         self.single_observation_space = observation_space()
@@ -62,13 +65,17 @@ class StrainVectorEnv(VectorEnv[Observed, Observed, Any]):
                 or shape.
         """
         if seed is not None:
-            several = isinstance(seed, Sequence | np.ndarray) and not isinstance(seed, str)
+            if isinstance(seed, np.ndarray):
+                seed = seed.tolist()  # a number if the array has no dimension
+            several = isinstance(seed, Sequence) and not isinstance(seed, str)
             parts = [part for part in seed if part is not None] if several else [seed]
             for part in parts:
                 whole_number("The seed", part, 0, 2**63 - 1)
             # without any number, the operating system gives one
             self._np_random = np.random.default_rng((parts or None) if several else parts[0])
             self._np_random_seed = None if several else int(parts[0])
+        if options is not None and not isinstance(options, Mapping):
+            raise InputError(f"The options are {shown(options)}. State a table, or None.")
         which = self._chosen((options or {}).get("reset_mask"))
         self._simulation.reset(which.astype(np.int64), self.np_random)
         self._ended[which] = False
@@ -88,7 +95,12 @@ class StrainVectorEnv(VectorEnv[Observed, Observed, Any]):
     def step(
         self, actions: Observed
     ) -> tuple[Observed, NDArray[np.float64], Flags, Flags, JsonObject]:
-        """Let 10 ms pass in all loops."""
+        """Let 10 ms pass in all loops, see `gymnasium.vector.VectorEnv.step`.
+
+        Raises:
+            InputError: The actions are not one finite number for each loop, or no episode has
+                begun.
+        """
         flat = actions_of(actions, self.num_envs)
         began = self._ended
         rewards, terminated, truncated = self._simulation.step(flat, self.np_random)

@@ -24,6 +24,7 @@ _MOST_FIGURES = 12
 _MOST_CURVES = 6
 _MOST_CHANGES = 12
 _MOST_CHARACTERS = 160
+_MOST_RESULTS, _MOST_VALUES = 8, 50  # columns and rows of a table over an axis
 
 #: Results of the cases, by name and by group.
 Values = Mapping[str, Mapping[str, Floats]]
@@ -57,7 +58,7 @@ def campaign_page(summary: Mapping[str, Any], values: Values) -> str:
         lead=f"{summary['cases']:,} cases of the kind {summary['kind']}, {summary['failed']:,} of "
         f"them failed. Design: {design['kind']}{repeats}. haselab {summary['code']}.",
         about=_about(summary),
-        figures=list(_figures(values)),
+        figures=[*_figures(values), *_figures_over(summary["over_axes"])],
         tables=[table for table in _tables(summary) if table.rows],
     )
 
@@ -131,6 +132,7 @@ def _tables(summary: Mapping[str, Any]) -> Iterator[_Table]:
             for one in summary["coverage"]
         ],
     )  # fmt: skip
+    yield from _over(summary["over_axes"])
     yield from _sensitivities(summary["sensitivities"])
     yield _Table(
         "Failed cases",
@@ -159,6 +161,97 @@ def _tables(summary: Mapping[str, Any]) -> Iterator[_Table]:
             for one in summary.get("comparison", ())
         ],
     )
+    yield _Table(
+        "Comparison case by case",
+        f"This campaign less that in {summary.get('compared_with', '')}. Both have the same drawn "
+        "values and random numbers, so each case has a partner, and differences between the "
+        "devices cancel. Cases without a finite value in both are left out. "
+        f"{_differences(summary.get('differs_in', ()))}",
+        ("Result", "Cases", "Left out", "Smallest difference", "Median difference",
+         "Largest difference"),
+        [
+            (one["result"], str(one["count"]), str(one["without_value"]), _text(one["least"]),
+             _with_interval(one["median"]), _text(one["largest"]))
+            for one in summary.get("paired", ())
+        ],
+    )  # fmt: skip
+
+
+def _over(found: Sequence[Mapping[str, Any]]) -> Iterator[_Table]:
+    """Tables of the results over each axis, and over two axes."""
+    by_axes: dict[tuple[str, ...], list[Mapping[str, Any]]] = {}
+    for one in found:
+        by_axes.setdefault(tuple(one["axes"]), []).append(one)
+    for axes, results in by_axes.items():
+        if len(axes) == 1:
+            yield _over_one(axes[0], results[:_MOST_RESULTS], len(results))
+        else:
+            yield from (_over_two(axes, result) for result in results[:_MOST_RESULTS])
+
+
+def _over_one(path: str, results: Sequence[Mapping[str, Any]], count: int) -> _Table:
+    points = results[0]["points"]
+    more = "" if len(points) <= _MOST_VALUES else (
+        f" The first {_MOST_VALUES} of {len(points)} values; summary.json has all."
+    )  # fmt: skip
+    more += "" if count == len(results) else f" {len(results)} of {count} results."
+    return _Table(
+        f"Results over {path}",
+        "Median of the cases at each value, over all values of the other parameters; in brackets "
+        f"the smallest and the largest, which are no interval of 95 %.{more}",
+        (path, "Cases", *(one["result"] for one in results)),
+        [
+            (_shown(point["at"][0]), str(point["count"] + point["without_value"]),
+             *(_spread(one["points"][k]) for one in results))
+            for k, point in enumerate(points[:_MOST_VALUES])
+        ],
+    )  # fmt: skip
+
+
+def _over_two(axes: Sequence[str], result: Mapping[str, Any]) -> _Table:
+    points = {tuple(point["at"]): point for point in result["points"]}
+    rows, columns = (list(dict.fromkeys(at[k] for at in points)) for k in (0, 1))
+    return _Table(
+        f"{result['result']} over {axes[0]} and {axes[1]}",
+        f"Median of the cases at each point. Columns: {axes[1]}.",
+        (axes[0], *map(_shown, columns)),
+        [
+            (_shown(row), *(_spread(points[row, column], spread=False) for column in columns))
+            for row in rows
+        ],
+    )
+
+
+def _spread(point: Mapping[str, Any], *, spread: bool = True) -> str:
+    if not point["count"]:
+        return ABSENT
+    if not spread or point["least"] == point["largest"]:
+        return _text(point["median"])
+    return f"{_text(point['median'])} ({_text(point['least'])} to {_text(point['largest'])})"
+
+
+def _figures_over(found: Sequence[Mapping[str, Any]]) -> Iterator[str]:
+    """Medians over one numeric axis, or over the first of two with a curve for some values."""
+    crossed = [one for one in found if len(one["axes"]) == 2]
+    for number, one in enumerate((crossed or found)[:_MOST_FIGURES]):
+        first = [point["at"][0] for point in one["points"]]
+        if not all(type(value) in (int, float) for value in first):
+            continue
+        curves = []
+        for value in list(dict.fromkeys(tuple(point["at"][1:]) for point in one["points"])):
+            points = [point for point in one["points"] if tuple(point["at"][1:]) == value]
+            y = np.array([point.get("median", math.nan) for point in points])
+            good = np.isfinite(y)
+            x = np.array([float(point["at"][0]) for point in points])
+            label = f"{one['axes'][1]} = {_shown(value[0])}" if value else ""
+            order = np.argsort(x[good])
+            if good.any():
+                curves.append(Curve(x[good][order], y[good][order], label))
+        if curves:
+            panel = Panel(one["axes"][0], one["result"], curves[:_MOST_CURVES])
+            chart = Chart(f"{one['result']}, median", (panel,))
+            with figure_style():
+                yield inline_svg(to_svg(draw_chart(chart), f"axis-{number}", one["result"]))
 
 
 def _differences(changes: Sequence[str]) -> str:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import shutil
 import sys
 from pathlib import Path
 
@@ -50,8 +51,17 @@ def test_the_answer_has_the_keys_of_the_contract_and_the_folder_the_results(
     assert (answer["cases"], answer["done"], answer["failed"]) == (2, 2, 0)
     assert answer["wall_s"] > 0.0 and 0.0 < answer["efficiency"] <= 1.0
     assert answer["summary"] == json.loads(Path("out/summary.json").read_text())
-    # a second start computes nothing; 2 cases are too few for a comparison
+    # a second start computes nothing; 2 cases are too few for medians, but they are the same ones
     assert code_of("campaign", file, "--out", "out", "--compare", "out") == 0
+    printed = capsys.readouterr()
+    summary = json.loads(Path("out/summary.json").read_text())
+    assert printed.err == "" and summary["comparison"] == []
+    assert {(each["count"], each["largest"]) for each in summary["paired"]} == {(2, 0.0)}
+    described = Path("out/campaign.json").read_text()
+    Path("other").mkdir()
+    shutil.copy("out/results.parquet", "other")
+    Path("other/campaign.json").write_text(described.replace('"seed": 0', '"seed": 1'))
+    assert code_of("campaign", file, "--out", "out", "--compare", "other") == 0
     printed = capsys.readouterr()
     assert printed.err.startswith("haselab: No comparison: no result has at least 8 values")
     assert "2 of 2 cases have a result, 0 failed" in printed.out

@@ -358,6 +358,7 @@ def test_a_breakdown_is_an_output_and_leaves_0_v(tmp_path: Path) -> None:
         ({"drive_v": float("nan")}, 0.01, "drive_v is nan V"),
         ({"carrier_v": 3.0}, 0.01, "The carrier is 3 V at 2000 Hz"),
         ({"carrier_hz": 1e6}, 0.01, "The carrier is 0 V at 1e+06 Hz"),
+        ({"carrier_hz": -5.0}, 0.01, "at -5 Hz, but it must be within 0 to 1 V, and between 0 and"),
         ({"force_n": float("inf")}, 0.01, "force_n is inf N"),
         ({"force_n": 500.0}, 1.0, "The actuator left the lengths in which its law is valid"),
         ({}, -0.01, "a step that is not negative"),
@@ -452,7 +453,7 @@ def test_calls_before_the_initialisation_or_after_it_are_errors(
     fails("The initialisation was not entered.", twin.fmu.exitInitializationMode)
     twin.begin()
     first_m = twin.get("length_m")
-    fails("A parameter was set during", lambda: twin.set_named({"load.mass_kg": 0.1}))
+    fails("load.mass_kg was set during", lambda: twin.set_named({"load.mass_kg": 0.1}))
     fails("The simulation has been initialised before.", lambda: twin.begin(5.0))
     twin.time_s = 0.0
     twin.step()
@@ -460,7 +461,37 @@ def test_calls_before_the_initialisation_or_after_it_are_errors(
     assert twin.get("length_m") == pytest.approx(first_m, rel=1e-4)
     for value in (np.inf, np.nan):
         fresh = planar.instance()
-        fails("is", lambda x=value, t=fresh: t.set_named({"amplifier.slew_v_per_s": x}))
+        fails(
+            f"amplifier.slew_v_per_s is {value:g}. Set a finite number.",
+            lambda x=value, t=fresh: t.set_named({"amplifier.slew_v_per_s": x}),
+        )
+    for name, value, limits in (
+        ("load.mass_kg", -1.0, "above 0, at most 20"),
+        ("amplifier.gain_error", 5.0, "within -0.5 to 0.5"),
+    ):
+        fails(
+            f"{name} is {value:g}. Set it {limits}.",
+            lambda n=name, x=value, t=fresh: t.set_named({n: x}),
+        )
+
+
+def test_a_step_after_the_end_is_an_error_until_a_reset(
+    planar: Unpacked, capsys: pytest.CaptureFixture[str]
+) -> None:
+    twin = planar.instance()
+    twin.begin()
+    twin.step()
+    found = twin.get("length_m")
+    twin.fmu.terminate()
+    with pytest.raises(FMICallException, match="status 3"):
+        twin.step()
+    assert "A step was made after the simulation was terminated." in capsys.readouterr().out
+    assert twin.get("length_m") == found, "the last outputs can still be read"
+    twin.fmu.reset()
+    twin.time_s = 0.0
+    twin.begin()
+    twin.step()
+    assert twin.get("length_m") == found
 
 
 def test_the_largest_field_stays_when_no_time_passes(planar: Unpacked) -> None:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import errno
 import os
 import time
 from pathlib import Path
@@ -94,9 +95,34 @@ def test_a_program_of_another_computer_has_its_claims_until_it_gives_no_sign_of_
         other.write_text("")
         (tmp_path / "claims" / "2").write_text(other.name)
         assert not first.take(2)
+        # the last sign of life is too old, or of a clock that was set back since
+        for block, shift_s in ((2, -EXPIRES_S - 1.0), (3, EXPIRES_S + 60.0)):
+            os.utime(other)
+            (tmp_path / "claims" / str(block)).write_text(other.name)
+            assert not first.take(block)
+            sign_s = time.time() + shift_s
+            os.utime(other, (sign_s, sign_s))
+            assert first.take(block)
+
+
+def test_without_locks_two_programs_of_one_computer_respect_each_other(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Else the second takes the first for one that has ended, and computes all cases again."""
+
+    def refuses(descriptor: int) -> None:
+        raise OSError(errno.ENOLCK, "No locks available")
+
+    monkeypatch.setattr(module, "hold", refuses)
+    monkeypatch.setattr(module, "is_held", lambda path: False)
+    with Claims(tmp_path) as first:
+        assert first.take(4)
+        with Claims(tmp_path) as second:
+            assert not second.take(4) and second.take(5) and not first.take(5)
         old_s = time.time() - EXPIRES_S - 1.0
-        os.utime(other, (old_s, old_s))
-        assert first.take(2)
+        os.utime(tmp_path / "programs" / first.writer, (old_s, old_s))
+        with Claims(tmp_path) as third:
+            assert third.take(4)
 
 
 def test_a_program_gives_signs_of_life(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

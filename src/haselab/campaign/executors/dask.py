@@ -10,13 +10,17 @@ import logging
 import multiprocessing
 import os
 import queue
+import threading
+from collections.abc import Sequence
 from typing import Any
 
 from haselab.base import DeviceError, HaselabError, InputError, text_of
 from haselab.campaign.executors.executor import Chunk, Outcome
-from haselab.campaign.plan import Problem
+from haselab.campaign.executors.processes import ProcessExecutor
+from haselab.campaign.plan import Job, Problem
 from haselab.campaign.work import compute_cases
 from haselab.runtime.scheduling import one_thread
+from haselab.store.campaign.shards import CaseRow
 from haselab.store.optional import library
 
 __all__ = ["LOCAL", "DaskExecutor"]
@@ -56,6 +60,53 @@ def _silence() -> None:
             logging.getLogger(name).setLevel(logging.CRITICAL + 1)
 
 
+# ---- on a worker -------------------------------------------------------------------------------
+
+# A thread of a Dask worker cannot be killed. With a time limit, each thread therefore has a process
+# that computes its cases, kept for the next chunks.
+_limited: dict[int, tuple[Problem, float, ProcessExecutor]] = {}
+_changing = threading.Lock()
+
+
+def _compute_limited(problem: Problem, jobs: Sequence[Job], limit_s: float) -> list[CaseRow]:
+    """Compute cases in another process; cases without a row have to be computed again."""
+    executor = _limited_executor(problem, limit_s)
+    executor.submit(Chunk(0, tuple(jobs)))
+    while not (outcomes := executor.wait(1.0)):
+        pass
+    rows = outcomes[0].rows
+    if rows is None:
+        raise RuntimeError("the process ended while it computed these cases")
+    return rows
+
+
+def _limited_executor(problem: Problem, limit_s: float) -> ProcessExecutor:
+    """The process of this thread."""
+    own = threading.get_ident()
+    with _changing:
+        old = _limited.pop(own, None)
+        if old is not None and old[:2] == (problem, limit_s):
+            _limited[own] = old
+            return old[2]
+        if old is not None:
+            old[2].close()
+        # Dask marks its workers as daemons, which Python does not let start processes.
+        multiprocessing.current_process().daemon = False
+        executor = ProcessExecutor(problem, 1, limit_s)
+        _limited[own] = (problem, limit_s, executor)
+        return executor
+
+
+def _end_limited() -> None:
+    """End the processes of all threads of a worker."""
+    with _changing:
+        while _limited:
+            _limited.popitem()[1][2].close()
+
+
+# ---- in the program ----------------------------------------------------------------------------
+
+
 class DaskExecutor:
     """An executor of Dask tasks.
 
@@ -63,14 +114,17 @@ class DaskExecutor:
         problem: what all cases share.
         address: of the scheduler; `local`: start a cluster on this computer.
         workers: processes of a local cluster.
+        limit_s: time of a case; None: any time.
     Raises:
         InputError: Dask is not installed, or there is no scheduler at the address.
     """
 
-    def __init__(self, problem: Problem, address: str, workers: int) -> None:
+    def __init__(
+        self, problem: Problem, address: str, workers: int, limit_s: float | None = None
+    ) -> None:
         distributed = library("distributed", _EXTRA)
         _silence()
-        self._problem, self._address = problem, address
+        self._problem, self._address, self._limit_s = problem, address, limit_s
         self._cluster: Any = None
         try:
             if address == LOCAL:
@@ -108,9 +162,11 @@ class DaskExecutor:
         Raises:
             DeviceError: the scheduler has gone.
         """
+        limited = self._limit_s is not None
         try:
             future = self._client.submit(
-                compute_cases, self._problem, chunk.jobs, pure=False,
+                _compute_limited if limited else compute_cases, self._problem, chunk.jobs,
+                *([self._limit_s] if limited else []), pure=False,
                 key=f"haselab-{os.getpid()}-{id(self)}-{chunk.number}",
             )  # fmt: skip
         except Exception as error:  # Dask raises many kinds when the connection closes
@@ -167,11 +223,16 @@ class DaskExecutor:
             "then this command."
         )
 
+    def longest(self) -> None:
+        """Not known: the cases run on other computers."""
+
     def close(self) -> None:
         """Give up what is in work, and leave the scheduler; a local cluster ends."""
         try:
             if self._client.status == "running":
                 self._client.cancel(list(self._futures))
+                if self._limit_s is not None:
+                    self._client.run(_end_limited, on_error="ignore")
             self._client.close(timeout=_GRACE_S)
         except Exception:  # the scheduler is gone; what counts is in the folder
             pass

@@ -30,7 +30,8 @@ class Outcome:
 
     Args:
         chunk: that was submitted.
-        rows: of its cases; None: the worker ended before.
+        rows: of its cases, perhaps not all: the others are computed again. None: the worker ended
+            before.
         blamed: whether the worker may have ended because of these cases.
     """
 
@@ -54,6 +55,12 @@ class Executor(Protocol):
 
         Raises:
             DeviceError: the executor itself has failed.
+        """
+
+    def longest(self) -> tuple[Job, float] | None:
+        """The case that has been running for the longest time, and this time in s.
+
+        None: no case is running, or the executor does not know.
         """
 
     def close(self) -> None:

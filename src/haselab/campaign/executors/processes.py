@@ -13,26 +13,73 @@ import os
 import queue
 import signal
 import threading
+import time
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
 from multiprocessing.connection import Connection, wait
 
 from haselab.base import DeviceError, HaselabError
 from haselab.campaign.executors.executor import Chunk, Outcome
-from haselab.campaign.plan import Problem
+from haselab.campaign.plan import Job, Problem
 from haselab.runtime.scheduling import one_thread
+from haselab.store.campaign.shards import CaseRow
 
 __all__ = ["ProcessExecutor"]
 
 _MOST_STARTS = 5  # in a row without one that became ready
 _END_S = 2.0
+_LOOKS = 8  # at the running cases, in each time limit
+_SPARE_S = 10.0  # beyond the limit, until a process that nobody watches any more ends by itself
+
+
+@dataclass(frozen=True)
+class _Running:
+    """The case that a process computes.
+
+    Args:
+        chunk: number of the chunk that it belongs to.
+        place: in the chunk.
+        since_s: when it began, on the monotonic clock of the computer.
+    """
+
+    chunk: int
+    place: int
+    since_s: float
+
+
+class _Stamp:
+    """Memory that a process shares with its parent, in which it keeps what it computes."""
+
+    def __init__(self) -> None:
+        self._numbers = multiprocessing.get_context("spawn").RawArray("d", 3)
+
+    def begin(self, chunk: int, place: int) -> None:
+        """Note the case that begins now."""
+        self._numbers[2] = 0.0  # a reader sees an old case, none, or the new one; never a mixture
+        self._numbers[0], self._numbers[1] = float(chunk), float(place)
+        self._numbers[2] = time.monotonic()
+
+    def end(self) -> None:
+        """Note that nothing is computed."""
+        self._numbers[2] = 0.0
+
+    def read(self) -> _Running | None:
+        """The running case; None: there is none, or it changes just now."""
+        since_s = self._numbers[2]
+        chunk, place = int(self._numbers[0]), int(self._numbers[1])
+        return _Running(chunk, place, since_s) if since_s == self._numbers[2] != 0.0 else None
 
 
 class _Worker:
     """One process, and what it was given."""
 
-    def __init__(self, problem: Problem) -> None:
+    def __init__(self, problem: Problem, limit_s: float | None) -> None:
         context = multiprocessing.get_context("spawn")
         self.pipe, other = context.Pipe()
-        self.process = context.Process(target=_serve, args=(other, problem), daemon=True)
+        self.stamp = _Stamp()
+        self.process = context.Process(
+            target=_serve, args=(other, problem, self.stamp, limit_s), daemon=True
+        )
         with one_thread():
             self.process.start()
         other.close()
@@ -46,11 +93,12 @@ class ProcessExecutor:
     Args:
         problem: what all cases share.
         workers: number of processes.
+        limit_s: time of a case, after which its process is killed; None: any time.
     """
 
-    def __init__(self, problem: Problem, workers: int) -> None:
-        self._problem, self._count = problem, workers
-        self._workers = [_Worker(problem) for _ in range(workers)]
+    def __init__(self, problem: Problem, workers: int, limit_s: float | None = None) -> None:
+        self._problem, self._count, self._limit_s = problem, workers, limit_s
+        self._workers = [_Worker(problem, limit_s) for _ in range(workers)]
         self._vain = 0
 
     @property
@@ -66,11 +114,13 @@ class ProcessExecutor:
             worker.pipe.send((chunk.number, chunk.jobs))
 
     def wait(self, longest_s: float) -> list[Outcome]:
-        """Wait for outcomes, and replace processes that have ended.
+        """Wait for outcomes, and replace processes that have ended or whose case takes too long.
 
         Raises:
             DeviceError: the processes end at their start, or one cannot compute any case.
         """
+        if self._limit_s is not None:
+            longest_s = min(longest_s, self._limit_s / _LOOKS)
         ready = wait([worker.pipe for worker in self._workers], longest_s)
         found: list[Outcome] = []
         for place, worker in enumerate(self._workers):
@@ -80,7 +130,40 @@ class ProcessExecutor:
                     found += self._replaced(place)
                 else:
                     found += outcomes
+            elif running := self._late_case(worker):
+                found += self._ended_late(place, running)
         return found
+
+    def longest(self) -> tuple[Job, float] | None:
+        """The case that is running for the longest time, and this time in s; None: none runs."""
+        found = [
+            (chunk.jobs[running.place], time.monotonic() - running.since_s)
+            for worker in self._workers
+            if (running := worker.stamp.read()) and (chunk := worker.given.get(running.chunk))
+        ]
+        return max(found, key=lambda each: each[1], default=None)
+
+    def _late_case(self, worker: _Worker) -> _Running | None:
+        """The running case of a process if it takes longer than the limit."""
+        running = worker.stamp.read()
+        if running is None or self._limit_s is None:
+            return None
+        return running if time.monotonic() - running.since_s > self._limit_s else None
+
+    def _ended_late(self, place: int, running: _Running) -> list[Outcome]:
+        """Kill a process and start another; the case that it was computing has failed."""
+        worker = self._workers[place]
+        spent_s = time.monotonic() - running.since_s
+        worker.process.kill()
+        worker.process.join()
+        found = self._received(worker) or []  # of the chunks before
+        ended_before = worker.stamp.read() != running
+        if not ended_before and (chunk := worker.given.pop(running.chunk, None)):
+            found.append(Outcome(chunk, [_late(chunk.jobs[running.place], self._limit_s, spent_s)]))
+        waiting = [Outcome(chunk, []) for chunk in worker.given.values()]
+        worker.pipe.close()
+        self._workers[place] = _Worker(self._problem, self._limit_s)
+        return [*found, *waiting]
 
     def _received(self, worker: _Worker) -> list[Outcome] | None:
         """What a process has sent; None: it has ended."""
@@ -113,7 +196,7 @@ class ProcessExecutor:
                     f"code {worker.process.exitcode}. Check the memory of the computer, or use "
                     "fewer workers."
                 )
-        self._workers[place] = _Worker(self._problem)
+        self._workers[place] = _Worker(self._problem, self._limit_s)
         first = itertools.chain([worker.is_ready], itertools.repeat(False))
         return [
             Outcome(chunk, None, blamed)
@@ -129,31 +212,55 @@ class ProcessExecutor:
             worker.pipe.close()
 
 
+def _late(job: Job, limit_s: float | None, spent_s: float) -> CaseRow:
+    error = (
+        f"The case was stopped because it took longer than time_limit_s = {limit_s:g}. Raise the "
+        "limit in the campaign file and add --retry-failed, or find out why the case takes so long."
+    )
+    return CaseRow(job.case, job.index, dict(job.values), {}, error, error, job.attempt, spent_s)
+
+
 # ---- in the process ----------------------------------------------------------------------------
 
 
-def _serve(pipe: Connection, problem: Problem) -> None:
+def _serve(pipe: Connection, problem: Problem, stamp: _Stamp, limit_s: float | None) -> None:
     """Compute what comes through the pipe until its other end closes."""
     signal.signal(signal.SIGINT, signal.SIG_IGN)  # Ctrl-C is for the program that started this one
     os.dup2(2, 1)  # a case must not print between the program's answers
     from haselab.campaign.work import compute_cases
 
-    coming: queue.SimpleQueue[tuple[int, tuple[object, ...]]] = queue.SimpleQueue()
+    coming: queue.SimpleQueue[tuple[int, tuple[Job, ...]]] = queue.SimpleQueue()
     threading.Thread(target=_receive, args=(pipe, coming), daemon=True).start()
     pipe.send((None, None))
     while True:
         number, jobs = coming.get()
         try:
-            rows: object = compute_cases(problem, jobs)  # type: ignore[arg-type]
+            rows: object = compute_cases(problem, _stamped(number, jobs, stamp, limit_s))
         except HaselabError as error:
             rows = error
+        stamp.end()
         try:
             pipe.send((number, rows))
         except OSError:
             os._exit(0)
 
 
-def _receive(pipe: Connection, coming: queue.SimpleQueue[tuple[int, tuple[object, ...]]]) -> None:
+def _stamped(
+    number: int, jobs: Sequence[Job], stamp: _Stamp, limit_s: float | None
+) -> Iterator[Job]:
+    """The cases of a chunk one by one, each with a stamp when it begins."""
+    for place, job in enumerate(jobs):
+        stamp.begin(number, place)
+        if limit_s is not None and hasattr(signal, "setitimer"):
+            # The parent kills a case that takes too long. If the parent has been killed itself, a
+            # case that hangs in compiled code keeps the thread below from ending this process.
+            signal.setitimer(signal.ITIMER_REAL, limit_s + _SPARE_S)
+        yield job
+    if limit_s is not None and hasattr(signal, "setitimer"):
+        signal.setitimer(signal.ITIMER_REAL, 0.0)
+
+
+def _receive(pipe: Connection, coming: queue.SimpleQueue[tuple[int, tuple[Job, ...]]]) -> None:
     """Take chunks at once, so that their sender never waits; end with the program that sends."""
     while True:
         try:

@@ -32,7 +32,9 @@ from haselab.campaign.summary import (
     draws_are_independent,
     groups_of,
     is_random,
+    paired,
     result_names,
+    share_cases,
     summarised,
 )
 from haselab.cli.common import WORKERS, answer_options, progress_bar
@@ -91,10 +93,10 @@ def command(
 
     def executor(problem: Problem, waiting: int) -> Executor:
         if scheduler is None:
-            return ProcessExecutor(problem, min(count, waiting))
+            return ProcessExecutor(problem, min(count, waiting), plan.campaign.time_limit_s)
         from haselab.campaign.executors.dask import DaskExecutor  # an optional package
 
-        return DaskExecutor(problem, scheduler, count)
+        return DaskExecutor(problem, scheduler, count, plan.campaign.time_limit_s)
 
     progress = Interruptible(progress_bar())
     found = run_cases(plan, out, executor, progress, retry_failed=retry_failed)
@@ -121,13 +123,14 @@ def command(
                 is_random(each) and draws_are_independent(each, grouped=False) for each in both
             )
             comparison = compared(rows, there[0], independent=independent)
-            if not comparison:
+            pairs = paired(rows, there[0], independent=independent) if share_cases(*both) else []
+            if not comparison and not pairs:
                 click.echo(
                     f"haselab: No comparison: no result has at least {LEAST_CASES} values and a "
                     f"finite median in both campaigns. {other}", err=True,
                 )  # fmt: skip
             summary |= {
-                "comparison": comparison, "compared_with": str(other),
+                "comparison": comparison, "paired": pairs, "compared_with": str(other),
                 "differs_in": changes_of(there[1], plan.campaign.described()),
             }  # fmt: skip
         write_text(out / "report.html", campaign_page(summary, _values(plan, rows)))

@@ -114,7 +114,7 @@ class Network:
             )
         except InputError as error:
             raise InputError(f"{error} {path}") from None
-        except (OSError, ValueError, KeyError, TypeError) as error:
+        except (OSError, ValueError, KeyError, TypeError, RecursionError) as error:
             raise InputError(
                 f"No network can be read ({described(error)}). Train one. {path}"
             ) from None

@@ -39,6 +39,7 @@ _MODEL = "haselab_twin"
 _STEP_SAMPLES = 20  # TWIN_SUB
 _DATE = (1980, 1, 1, 0, 0, 0)  # of the files in the archive: the same twin gives the same bytes
 
+_NAME = 56  # bytes of a name in the resources, as FMU_NAME in native/fmu/instance.h
 # Value references and places of native/fmu/bench.h.
 _INPUTS = (
     ("drive_v", "V", 0.0, "voltage at the amplifier's input"),
@@ -342,14 +343,20 @@ def _resource(config: TwinConfig, free: list[_Setting], fixed: list[_Setting], s
     parts = [
         struct.pack(
             "<8s5I3i7d",
-            b"HASELFMU", 1, parameters, state, len(free), len(fixed),
+            b"HASELFMU", 2, parameters, state, len(free), len(fixed),
             daq.block_samples, seed, 0,
             daq.drive_low_v, daq.drive_high_v,
             amplifier.gain * (1.0 + amplifier.gain_error) * highest_v,
             CLAMP_KG, config.law.moving_mass_kg, SETTLE_S, GRAVITY_M_S2,
         )
     ]  # fmt: skip
-    parts += [struct.pack("<q3d", each.place, each.value, each.low, each.high) for each in free]
+    parts += [
+        struct.pack(
+            f"<q3d{_NAME}s", each.place, each.value, each.low, each.high,
+            each.key.encode()[: _NAME - 1],
+        )
+        for each in free
+    ]  # fmt: skip
     parts += [struct.pack("<d", each.value) for each in fixed]
     parts.append(ctypes.string_at(bench.addresses[0], parameters))
     return b"".join(parts)

@@ -52,8 +52,11 @@ class Claims:
                 f"Cannot write ({error.strerror}). Free disk space, or change the permissions. "
                 f"{self._programs}"
             ) from None
-        with contextlib.suppress(OSError):  # a file system without locks
+        try:
             hold(self._file.fileno())
+            self._has_locks = CAN_TELL
+        except OSError:  # a file system without locks
+            self._has_locks = False
         self._remove_ended()
         threading.Thread(target=self._sign, daemon=True).start()
         return self
@@ -131,7 +134,7 @@ class Claims:
         try:
             name = claim.read_text(encoding="utf-8")
             if not name:  # just created, or its program ended in between
-                return time.time() - claim.stat().st_mtime < EXPIRES_S
+                return _is_recent(claim)
             return self._is_program_alive(self._programs / name)
         except OSError:  # the claim has gone
             return False
@@ -141,9 +144,21 @@ class Claims:
         if is_held(program):
             return True
         here = program.name.startswith(f"{socket.gethostname()[:40]}-")
-        if here and CAN_TELL:
+        if here and self._has_locks:
             return False
         try:
-            return time.time() - program.stat().st_mtime < EXPIRES_S
+            return _is_recent(program)
         except OSError:  # it has ended
             return False
+
+
+def _is_recent(path: Path) -> bool:
+    """Whether the last sign of life is not too old.
+
+    One from the future is of a clock that was set back, or of another computer. If it counted, the
+    claim of a program that has ended would last until the clock comes to it.
+
+    Raises:
+        OSError: there is no such file.
+    """
+    return abs(time.time() - path.stat().st_mtime) < EXPIRES_S

@@ -1,0 +1,173 @@
+"""Results over the axes, Sobol indices of published functions, and campaigns in pairs."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import replace
+from typing import Any
+
+import numpy as np
+import pytest
+
+from haselab.campaign.definition import Axis
+from haselab.campaign.summary import paired, share_cases, summarised
+from haselab.report.campaign_page import campaign_page
+from haselab.store.campaign.shards import CaseRow
+
+GRID = """
+name = "a"
+kind = "transfer"
+[parameters]
+case.gain = [2.0, 1.0, 3.0]
+case.delay_s = [0.0, 0.01]
+"""
+UNIFORM = """
+name = "a"
+kind = "transfer"
+[parameters]
+case.gain = {{ uniform = [0.0, 1.0] }}
+case.natural_frequency_rad_s = {{ uniform = [0.0, 1.0] }}
+case.slow_gain = {{ uniform = [0.0, 1.0] }}
+[design]
+kind = "saltelli"
+samples = {}
+"""
+
+
+def rows_of(plan: Any, function: Any) -> list[CaseRow]:
+    return [
+        CaseRow(f"{k}", k, plan.values(k), {"y": float(function(*plan.values(k).values()))})
+        for k in range(plan.count)
+    ]
+
+
+def ishigami(first: float, second: float, third: float) -> float:
+    a, b, c = (2.0 * math.pi * (x - 0.5) for x in (first, second, third))
+    return math.sin(a) + 7.0 * math.sin(b) ** 2 + 0.1 * c**4 * math.sin(a)
+
+
+def g_function(*point: float) -> float:
+    return math.prod((abs(4 * x - 2) + a) / (1 + a) for x, a in zip(point, G, strict=True))
+
+
+G = (0.0, 1.0, 4.5)
+PARTIAL = [1.0 / (3.0 * (1.0 + a) ** 2) for a in G]
+WHOLE = math.prod(1.0 + v for v in PARTIAL) - 1.0
+
+
+@pytest.mark.long
+@pytest.mark.parametrize(
+    ("function", "first", "total"),
+    [
+        # Saltelli et al., Global Sensitivity Analysis: The Primer, 2008, with a = 7 and b = 0.1
+        (ishigami, [0.3139, 0.4424, 0.0], [0.5576, 0.4424, 0.2437]),
+        # Sobol, 2001: the partial variances of the g-function are 1 / (3 (1 + a)^2)
+        (
+            g_function,
+            [v / WHOLE for v in PARTIAL],
+            [
+                v * math.prod(1.0 + w for w in PARTIAL[:k] + PARTIAL[k + 1 :]) / WHOLE
+                for k, v in enumerate(PARTIAL)
+            ],
+        ),
+    ],
+)
+def test_sobol_indices_are_the_published_ones(
+    campaigns: Any, function: Any, first: list[float], total: list[float]
+) -> None:
+    """The half widths, of 95 %, become those of more than 99.9 %: six numbers are compared."""
+    plan = campaigns.plan(UNIFORM.format(1024))
+    found = summarised(plan, rows_of(plan, function))["sensitivities"]
+    assert len(found) == 3
+    for one, *true in zip(found, first, total, strict=True):
+        for index, share in zip(("first", "total"), true, strict=True):
+            low, high = one[index]["ci95"]
+            assert one[index]["value"] == pytest.approx(share, abs=(high - low))
+            assert high - low < 0.2
+
+
+@pytest.mark.parametrize(("samples", "given"), [(32, False), (64, True)])
+def test_sobol_indices_of_few_blocks_have_no_interval(
+    campaigns: Any, samples: int, *, given: bool
+) -> None:
+    plan = campaigns.plan(UNIFORM.format(samples))
+    summary = summarised(plan, rows_of(plan, lambda a, b, c: a + b * c))
+    found = [one[index]["ci95"] for one in summary["sensitivities"] for index in ("first", "total")]
+    assert len(found) == 6 and all((each is not None) == given for each in found)
+    assert "Sensitivity: Sobol indices" in campaign_page(summary, {})
+
+
+def test_a_grid_has_its_results_over_each_axis_and_both(campaigns: Any) -> None:
+    plan = campaigns.plan(GRID)
+    rows = rows_of(plan, lambda gain, delay: gain + 100.0 * delay)
+    rows[1].results["y"] = math.nan  # of gain 2 and delay 0.01
+    rows[4].results["y"] = math.inf  # of gain 3 and delay 0
+    summary = summarised(plan, rows)
+    found = {tuple(one["axes"]): one["points"] for one in summary["over_axes"]}
+    assert found["case.gain",] == [
+        {"at": [2.0], "count": 1, "without_value": 1, "least": 2.0, "median": 2.0, "largest": 2.0},
+        {"at": [1.0], "count": 2, "without_value": 0, "least": 1.0, "median": 1.5, "largest": 2.0},
+        {"at": [3.0], "count": 2, "without_value": 0, "least": 4.0, "median": math.inf,
+         "largest": math.inf},
+    ]  # fmt: skip
+    assert [point["median"] for point in found["case.delay_s",]] == [2.0, 3.0]
+    both = found["case.gain", "case.delay_s"]
+    assert [point["at"] for point in both[:3]] == [[2.0, 0.0], [2.0, 0.01], [1.0, 0.0]]
+    assert [point.get("median") for point in both] == [2.0, None, 1.0, 2.0, math.inf, 4.0]
+    page = campaign_page(summary, {})
+    assert "<th>case.gain</th><th>Cases</th><th>y</th>" in page
+    assert '<th scope="row">1</th><td>2</td><td>1.5 (1 to 2)</td>' in page
+    assert '<th scope="row">3</th><td>not reached</td><td>4</td>' in page
+    assert page.count("<svg") == 1 and "case.delay_s = 0.01" in page
+
+
+@pytest.mark.parametrize("levels", [("zero", "one"), (True, False)])
+def test_an_axis_of_texts_has_a_table_and_no_figure(campaigns: Any, levels: Any) -> None:
+    plan = campaigns.plan(GRID)
+    plan.campaign = replace(plan.campaign, axes=(Axis("case.mode", levels),))
+    rows = [CaseRow(f"{k}", k, {"case.mode": level}, {"y": float(k)})
+            for k, level in enumerate(levels)]  # fmt: skip
+    summary = summarised(plan, rows)
+    assert [one["axes"] for one in summary["over_axes"]] == [["case.mode"]]
+    page = campaign_page(summary, {})
+    assert f'<th scope="row">{levels[1]}</th><td>1</td><td>1</td>' in page and "<svg" not in page
+
+
+def test_distributions_at_each_point_need_no_further_tables(campaigns: Any) -> None:
+    plan = campaigns.plan(GRID + "[design]\nrepeats = 8")
+    assert summarised(plan, rows_of(plan, lambda gain, delay: gain))["over_axes"] == []
+
+
+def test_infinities_of_both_signs_have_no_mean_and_no_warning(campaigns: Any) -> None:
+    plan = campaigns.plan(GRID)
+    rows = rows_of(plan, lambda gain, delay: math.inf if gain > 1.5 else -math.inf)
+    (found,) = summarised(plan, rows)["distributions"]
+    assert math.isnan(found["mean"]) and found["least"] == -math.inf
+
+
+def test_cases_with_the_same_draws_are_compared_in_pairs(campaigns: Any) -> None:
+    """The devices differ by 10 and the change is 0.1: only the pairs show it."""
+    text = campaigns.quick.replace("samples = 8", "samples = 16").replace("[0.01, 0.02]", "[0.01]")
+    here, there, other = (
+        campaigns.plan(text.replace("1.0\nrate", f"{duration}\nrate").replace("= 7", f"= {seed}"))
+        for duration, seed in ((1.0, 7), (2.0, 7), (1.0, 8))
+    )
+    described = [plan.campaign.described() for plan in (here, there, other)]
+    assert described[0] != described[1] and share_cases(*described[:2])
+    assert not share_cases(described[0], described[2])
+    rng = np.random.default_rng(4)
+    devices = rng.normal(0.0, 10.0, 16)
+    rows = [CaseRow(f"{k}", k, here.values(k), {"y": y}) for k, y in enumerate(devices + 0.1)]
+    rows[3].results["y"] = math.inf
+    rows[4].results.clear()
+    table = {"y": devices + rng.normal(0.0, 0.01, 16), "z": np.zeros(16)}
+    table["y"][3] = math.inf
+    (found,) = paired(rows, table, independent=True)
+    assert (found["count"], found["without_value"]) == (14, 2)
+    low, high = found["median"]["ci95"]
+    assert found["least"] <= low < 0.1 < high <= found["largest"] and high - low < 0.05
+    (grid,) = paired(rows, table, independent=False)
+    assert grid["median"] == {"value": found["median"]["value"], "ci95": None}
+    assert paired(rows, {"y": np.zeros(15)}, independent=True) == []
+    page = campaign_page(summarised(here, rows) | {"paired": [found], "comparison": []}, {})
+    assert "Comparison case by case" in page

@@ -39,7 +39,7 @@ def compute_cases(problem: Problem, jobs: Iterable[Job]) -> list[CaseRow]:
     if own != problem.code:
         raise DeviceError(
             f"A worker has haselab {own}, but the campaign was started by {problem.code}. Install "
-            "the same version on all computers."
+            "the same version on all computers, and do not change its source while it runs."
         )
     return [compute_case(problem, job) for job in jobs]
 

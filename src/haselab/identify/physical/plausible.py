@@ -89,10 +89,15 @@ def motion_before_drive(records: Sequence[MotionRecord]) -> str:
         moved_m, noise_m = float(np.ptp(early_m)), float(np.median(record.length_std_m))
         most_m = max(_SHARE_BEFORE * float(np.ptp(record.length_m)), _BEFORE * noise_m)
         if float(np.std(early_m)) > _BEFORE * noise_m and moved_m > most_m:
+            when = (
+                f"before the voltage first changes, after {end_s - drive.edge_s[0]:.3g} s"
+                if changes.size
+                else "although the voltage never changes"
+            )
             return (
-                f"{record.name}: the length changes by {1e6 * moved_m:.3g} um before the voltage "
-                f"first changes, after {end_s - drive.edge_s[0]:.3g} s, but each record is assumed "
-                "to begin at rest under its first voltage. Give the record from its beginning"
+                f"{record.name}: the length changes by {1e6 * moved_m:.3g} um {when}, but each "
+                "record is assumed to begin at rest under its first voltage. Give the record from "
+                "its beginning"
             )
     return ""
 

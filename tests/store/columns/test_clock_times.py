@@ -41,6 +41,8 @@ def stamps(form: str, start: datetime = START) -> list[str]:
         ("%Y-%m-%dT%H:%M:%S.%f+02:00", "time,u,y"),
         ('"%Y-%m-%d %H:%M:%S.%f"', '"time","u","y"'),
         ("%d.%m.%Y %H:%M:%S,%f", "Datum/Uhrzeit;u;y"),
+        ("%H:%M:%S.%f", "Uhrzeit,u,y"),
+        ("%I:%M:%S.%f %p", "time,u,y"),
     ],
 )
 def test_dates_and_times_give_the_rate_across_midnight(

@@ -5,7 +5,7 @@ from __future__ import annotations
 import re
 from datetime import date
 
-__all__ = ["clock_s"]
+__all__ = ["DAY_S", "clock_s"]
 
 _CLOCK = re.compile(
     r"(?:(?P<year>\d{4})-(?P<month>\d\d)-(?P<day>\d\d)[T ]\s*"
@@ -16,7 +16,7 @@ _CLOCK = re.compile(
     r"\s*(?:Z|UTC|(?P<sign>[+-])(?P<offset>\d\d):?(?P<minutes>\d\d))?",
     re.IGNORECASE,
 )
-_DAY_S, _HOUR_S, _MINUTE_S = 86_400, 3_600, 60
+DAY_S, _HOUR_S, _MINUTE_S = 86_400, 3_600, 60
 
 
 def clock_s(cell: str, first_day: int | None = None) -> tuple[float, int] | None:
@@ -62,4 +62,4 @@ def clock_s(cell: str, first_day: int | None = None) -> tuple[float, int] | None
     if found["sign"]:
         ahead = _HOUR_S * int(found["offset"]) + _MINUTE_S * int(found["minutes"])
         seconds -= ahead if found["sign"] == "+" else -ahead
-    return _DAY_S * (day - first_day) + seconds, first_day
+    return DAY_S * (day - first_day) + seconds, first_day

@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 
 from haselab.base import InputError
 from haselab.store.columns.archive import Archive, MissingColumnsError, Take, positive
-from haselab.store.columns.text.clock import clock_s
+from haselab.store.columns.text.clock import DAY_S, clock_s
 from haselab.store.columns.text.labview import labview_header
 from haselab.store.columns.text.text_layout import (
     HEAD_BYTES,
@@ -222,6 +222,7 @@ class _Rows:
         self._line_number = layout.first_line + 1
         self._clocks = layout.clocks.intersection(places)
         self._first_days: dict[int, int | None] = dict.fromkeys(self._clocks)
+        self._latest_s: dict[int, float] = {}
 
     def numbers(self, lines: Sequence[str]) -> NDArray[np.float64]:
         """The rows of the next lines, shape `(rows, columns)`."""
@@ -306,7 +307,11 @@ class _Rows:
                 "has changed and is written with slashes, whose order is not known. Change or "
                 f"remove the line, or write dates as 2026-03-29: {self._file}"
             )
-        seconds, self._first_days[place] = found
+        seconds, day = found
+        self._first_days[place] = day
+        if day == 0:  # no date: a fall by half a day or more is midnight
+            days = round((self._latest_s.get(place, seconds) - seconds) / DAY_S)
+            self._latest_s[place] = seconds = seconds + DAY_S * max(days, 0)
         return seconds
 
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 from typing import Any
 
@@ -119,11 +120,15 @@ class _Loops:
 
     def returns(self, weights: NDArray[np.int32], seed: int) -> Floats:
         """Mean objective per update of each network. Shape `(P,)`."""
-        whole = np.zeros(self._population)
-        for simulation in self._simulations:
+
+        def played(simulation: StrainSimulation) -> Floats:
             rng = np.random.default_rng(seed)
             simulation.reset_alike(self._population, rng)
-            whole += self._play(simulation, weights, rng)
+            return self._play(simulation, weights, rng)
+
+        # the compiled twin lets other threads run
+        with ThreadPoolExecutor(len(self._simulations)) as threads:
+            whole = sum(threads.map(played, self._simulations), np.zeros(self._population))
         return whole / len(self._simulations)
 
     def _play(

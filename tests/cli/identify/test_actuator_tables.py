@@ -243,9 +243,14 @@ def test_a_record_that_begins_in_motion_is_named():
     rng = np.random.default_rng(1)
     still_m = np.where(time_s < 0.2, 0.035, 0.034) + 1e-6 * rng.standard_normal(60)
     moving_m = still_m - 4e-4 * np.exp(-time_s / 0.1)
-    for length_m, words in ((still_m, ""), (moving_m, "before the voltage first changes")):
+    constant_v = np.full(60, 3e3)
+    for length_m, drive_v, words in (
+        (still_m, voltage_v, ""),
+        (moving_m, voltage_v, "before the voltage first changes"),
+        (moving_m, constant_v, "although the voltage never changes"),
+    ):
         record = motion_of_table(
-            "a", time_s, voltage_v, mass_kg=0.3, length_m=length_m, length_std_m=1e-6
+            "a", time_s, drive_v, mass_kg=0.3, length_m=length_m, length_std_m=1e-6
         )
         assert words in motion_before_drive([record]) and bool(words) == bool(
             motion_before_drive([record])

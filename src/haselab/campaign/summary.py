@@ -143,6 +143,7 @@ def summarised(plan: Plan, rows: Sequence[CaseRow]) -> JsonObject:
             if (found := _coverage(group, name, independent=independent))
         ],
         "sensitivities": list(_sensitivities(campaign, groups, names, independent=independent)),
+        "unranked": [*_unranked(campaign)],
         "over_axes": _over_axes(campaign, groups, names),
         "failures": _failures(rows),
         "without_effect": [*_without_effect(campaign, rows)],
@@ -273,7 +274,8 @@ def _share_interval(inside: int, count: int) -> list[float]:
 def _sensitivities(
     campaign: Campaign, groups: Sequence[Group], names: Sequence[str], *, independent: bool
 ) -> Iterator[JsonObject]:
-    paths = [one.path for one in campaign.distributions if one.shape != "choice"]
+    unranked = _unranked(campaign)
+    paths = [one.path for one in campaign.distributions if one.path not in unranked]
     for name in names:
         for group in groups:
             if campaign.design.kind == "saltelli":
@@ -282,6 +284,14 @@ def _sensitivities(
                 found = _rank_correlations(group, name, paths, independent=independent)
             for one in found:
                 yield {"result": name, "group": group.label, **one}
+
+
+def _unranked(campaign: Campaign) -> list[str]:
+    """Parameters that are drawn from values that are no numbers, so that they have no ranks."""
+    return [
+        one.path for one in campaign.distributions
+        if not all(isinstance(each, (int, float)) for each in one.numbers)
+    ]  # fmt: skip
 
 
 def _is_whole(campaign: Campaign, groups: Sequence[Group]) -> bool:
@@ -394,7 +404,11 @@ def _without_effect(campaign: Campaign, rows: Sequence[CaseRow]) -> list[str]:
 
 
 def compared(
-    here: Sequence[CaseRow], there: Mapping[str, Floats], *, independent: bool = True
+    here: Sequence[CaseRow],
+    there: Mapping[str, Floats],
+    *,
+    independent: bool = True,
+    in_pairs: bool = False,
 ) -> list[Json]:
     """Compare the results of two campaigns.
 
@@ -403,6 +417,7 @@ def compared(
         there: results of the other one, by name.
         independent: the cases of both are independent draws, see `draws_are_independent` and
             `is_random`.
+        in_pairs: the cases are the same, see `share_cases`: only those with a value in both count.
     Returns:
         For each result with finite medians in both: the medians, the number of cases without a
         value, which they leave out, and the difference of the medians with its bootstrap interval.
@@ -410,9 +425,11 @@ def compared(
     rng = np.random.default_rng(_SEED)
     group, found = Group("", tuple(here)), list[Json]()
     for name in result_names(here):
-        first = group.present(name)
-        others = there.get(name, np.zeros(0))
-        second = others[~np.isnan(others)]
+        values, others = group.values(name), there.get(name, np.zeros(0))
+        counted = ~np.isnan(values), ~np.isnan(others)
+        if in_pairs and values.size == others.size:
+            counted = (counted[0] & counted[1],) * 2
+        first, second = values[counted[0]], others[counted[1]]
         if min(first.size, second.size) < LEAST_CASES:
             continue
         medians = [float(np.median(part)) for part in (first, second)]

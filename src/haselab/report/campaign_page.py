@@ -20,6 +20,7 @@ from haselab.report.style import figure_style, inline_svg, to_svg
 __all__ = ["campaign_page"]
 
 Floats = NDArray[np.float64]
+_MANY = 0.05  # share of failed cases that the page warns of
 _MOST_FIGURES = 12
 _MOST_CURVES = 6
 _MOST_CHANGES = 12
@@ -68,9 +69,22 @@ def _packaged(name: str) -> str:
 
 
 def _about(summary: Mapping[str, Any]) -> str:
-    unused = summary.get("without_effect", ())
-    more = f" No result depends on {', '.join(unused)}." if unused else ""
-    return _meaning(summary) + more
+    parts = [_meaning(summary)]
+    if summary["failed"] > _MANY * summary["cases"]:
+        parts.append(
+            f"{summary['failed']:,} of {summary['cases']:,} cases failed. All distributions, "
+            "medians and sensitivities are those of the other cases, which may differ from all: "
+            "see the parameters of the failed cases."
+        )
+    if unused := summary.get("without_effect", ()):
+        parts.append(f"No result depends on {', '.join(unused)}.")
+    if unranked := summary["unranked"]:
+        parts.append(
+            f"The sensitivities leave out {', '.join(unranked)}, whose values are no numbers."
+        )
+    if summary["is_random"] and not summary["sensitivities"]:
+        parts.append("There are no sensitivities: too few cases have a value, or none changes.")
+    return " ".join(parts)
 
 
 def _meaning(summary: Mapping[str, Any]) -> str:
@@ -149,7 +163,8 @@ def _tables(summary: Mapping[str, Any]) -> Iterator[_Table]:
         "Comparison",
         f"This campaign against that in {summary.get('compared_with', '')}. The interval of the "
         "difference is from resampling both; without draws there is none. Cases without a value "
-        "are left out, and so are results whose median was not reached. "
+        "are left out, and so are results whose median was not reached. If both campaigns have the "
+        "same cases, only those with a value in both count. "
         f"{_differences(summary.get('differs_in', ()))}",
         ("Result", "Median here", "Median there", "Difference", "Without a value, here and there"),
         [

@@ -28,7 +28,7 @@ __all__ = ["LOCAL", "DaskExecutor"]
 LOCAL = "local"  # in place of an address
 _EXTRA = "dask"
 _CONNECT_S = 20.0
-_LEAST_SLOTS = 2  # while workers are still coming, so that an adaptive cluster sees work
+_LEAST_SLOTS = 1  # while workers are still coming, so that an adaptive cluster sees work
 _GRACE_S = 5.0
 # Of a local cluster, whose scheduler and workers share the cores with the cases: no sampling of
 # Python stacks, and fewer looks at memory and load. Dask's own values cost about 20 % of the time.

@@ -56,7 +56,7 @@ __all__ = ["command"]
     "computer. Default: processes without Dask.",
 )  # fmt: skip
 @click.option(
-    "--retry-failed", is_flag=True, help="Compute failed cases again, and no finished ones."
+    "--retry-failed", is_flag=True, help="Compute failed cases again, and keep the others."
 )
 @click.option(
     "--compare", "other", type=click.Path(path_type=Path), metavar="DIR",
@@ -122,8 +122,9 @@ def command(
             independent = all(
                 is_random(each) and draws_are_independent(each, grouped=False) for each in both
             )
-            comparison = compared(rows, there[0], independent=independent)
-            pairs = paired(rows, there[0], independent=independent) if share_cases(*both) else []
+            shared = share_cases(*both)
+            comparison = compared(rows, there[0], independent=independent, in_pairs=shared)
+            pairs = paired(rows, there[0], independent=independent) if shared else []
             if not comparison and not pairs:
                 click.echo(
                     f"haselab: No comparison: no result has at least {LEAST_CASES} values and a "

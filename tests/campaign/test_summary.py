@@ -12,6 +12,7 @@ import numpy as np
 import pytest
 
 from haselab.base import InputError
+from haselab.campaign.definition import Distribution
 from haselab.campaign.folder import TABLE, read_results
 from haselab.campaign.summary import (
     compared,
@@ -90,6 +91,39 @@ def test_rank_correlations_are_those_of_monotone_and_unrelated_parameters(campai
     assert found["case.gain"]["value"] == pytest.approx(-1.0)
     low, high = found["case.natural_frequency_rad_s"]["ci95"]
     assert low < 0.0 < high and high - low == pytest.approx(2 * 1.96 / math.sqrt(197), rel=0.05)
+
+
+def test_a_choice_of_numbers_has_a_rank_and_one_of_texts_is_named(campaigns: Any) -> None:
+    drawn = "case.gain = {{ uniform = [0.0, 1.0] }}"
+    text = DESIGN.replace(drawn, "case.gain = {{ choice = [0.2, 0.5, 0.3] }}")
+    plan = campaigns.plan(text.format("random", 60))
+    rows = rows_of(plan, lambda gain, omega: gain)
+    summary = summarised(plan, rows)
+    found = {one["parameter"]: one["correlation"] for one in summary["sensitivities"]}
+    assert found["case.gain"]["value"] == pytest.approx(1.0) and summary["unranked"] == []
+    texts = Distribution("case.gain", "choice", ("low", "high"))
+    plan.campaign = replace(plan.campaign, distributions=(texts, *plan.campaign.distributions[1:]))
+    rows = [replace(row, values={**row.values, "case.gain": "low"}) for row in rows]
+    summary = summarised(plan, rows)
+    assert [one["parameter"] for one in summary["sensitivities"]] == [
+        "case.natural_frequency_rad_s"
+    ]
+    assert "leave out case.gain, whose values are no numbers" in campaign_page(summary, {})
+
+
+def test_medians_of_the_same_cases_leave_out_those_without_a_value_in_both(campaigns: Any) -> None:
+    """The larger devices fail here, so the median of the others alone would be smaller here."""
+    plan = campaigns.plan(DESIGN.format("random", 60))
+    rows = rows_of(plan, lambda gain, omega: gain + 0.1)
+    there = np.array([row.results["y"] - 0.1 for row in rows])
+    rows = [row if there[k] < 0.6 else replace(row, results={}, error="it failed")
+            for k, row in enumerate(rows)]  # fmt: skip
+    (found,) = compared(rows, {"y": there}, in_pairs=True)
+    assert found["difference"]["value"] == pytest.approx(0.1)
+    (apart,) = compared(rows, {"y": there})
+    assert apart["difference"]["value"] < 0.0
+    page = campaign_page(summarised(plan, rows), {})
+    assert "of 60 cases failed. All distributions" in page
 
 
 def test_coverage_counts_intervals_that_contain_the_truth(campaigns: Any) -> None:

@@ -86,7 +86,17 @@ class ControllerKind:
         Raises:
             InputError: The kind needs the identified actuator, and there is none.
         """
-        if setting.actuator is None and (self.needs_actuator or self.output == "voltage"):
+        self.check_actuator(setting.actuator)
+
+    def check_actuator(self, actuator: KnownActuator | None) -> None:
+        """Refuse a missing actuator if the kind needs it.
+
+        Args:
+            actuator: identified; None: it is not known.
+        Raises:
+            InputError: The kind needs the identified actuator, and there is none.
+        """
+        if actuator is None and (self.needs_actuator or self.output == "voltage"):
             raise InputError(f"Controller of kind {self.name!r} {_NO_ACTUATOR}")
 
     def preview_steps(self, period_s: float) -> int:

@@ -103,6 +103,17 @@ def test_without_the_file_such_a_study_says_what_is_missing(
     assert "Add operating_point.baseline_v" in capsys.readouterr().err
 
 
+def test_a_controller_that_needs_the_physical_model_is_refused_before_anything_moves(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    study, rig, out = tmp_path / "s.toml", tmp_path / "rig.toml", tmp_path / "o"
+    study.write_text(TRIANGLE + STEPS.partition("\n")[2] + '[control]\nkind = "network"\n')
+    rig.write_text('kind = "twin"\n')
+    assert run("run", study, "--rig", rig, "--out", out) == 2
+    assert "kind 'network' needs the physical model of the actuator" in capsys.readouterr().err
+    assert not (out / "session.h5").exists()
+
+
 @pytest.mark.long
 def test_the_highest_field_of_the_file_limits_the_drive(
     known: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]

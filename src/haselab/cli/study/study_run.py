@@ -27,6 +27,7 @@ from haselab.cli.study.model_control import play_model_control
 from haselab.cli.study.noise_free_run import NoiseFreeRun
 from haselab.cli.study.physical_model import identify_physical_model
 from haselab.cli.study.recommended_mass import with_mass_limit
+from haselab.controllers import KnownActuator
 from haselab.models.actuator import ActuatorTables
 from haselab.rig import Rig
 from haselab.rig.rig_file import MAX_SEED
@@ -36,11 +37,14 @@ from haselab.runtime.camera_recorder import KeepVideo
 from haselab.store.actuator_file import ACTUATOR
 from haselab.store.manifest import read_manifest, recorded_when
 from haselab.store.session.writer import SessionReader
+from haselab.study.analysis import experiments_of
 from haselab.study.chip.rows import with_chip_rows
 from haselab.study.definition import Study
 from haselab.study.experiment import ExperimentResult
 from haselab.study.feasibility import check_drives
 from haselab.study.folder import sections_found, write_findings
+from haselab.study.known import known_values
+from haselab.study.own_controller import own_controller
 from haselab.study.physical.session import NOT_HERE, with_model_rows
 from haselab.study.pipeline import Findings
 from haselab.study.run import RunOptions, run_study, session_header
@@ -102,10 +106,14 @@ def check_folder(folder: Path) -> None:
         raise InputError(f"--out names a file, not a folder. Name a new folder. {folder}")
 
 
-def _check_before_anything_moves(study: Study, rig: Rig, folder: Path) -> None:
-    """Refuse a study now that this rig would refuse hours later."""
-    check_folder(folder)
+def _check_before_anything_moves(study: Study, rig: Rig, options: RunOptions) -> None:
+    """Refuse a study now that this rig or its controller would refuse hours later."""
+    check_folder(options.folder)
     check_drives(study, rig.description)
+    found = {kind for experiment in experiments_of(study) for kind in experiment.gives}
+    if (own := own_controller(study)) is not None and KnownActuator not in found:
+        known = {} if options.known is None else known_values(options.known)
+        own.kind.check_actuator(cast("KnownActuator | None", known.get(KnownActuator)))
 
 
 def execute(
@@ -165,7 +173,7 @@ def _execute(
     modelled: TwinConfig | None = None,
 ) -> None:
     folder = options.folder
-    _check_before_anything_moves(study, rig, folder)
+    _check_before_anything_moves(study, rig, options)
     progress = Interruptible(progress_bar())
     noise_free = None
     running = ExitStack()

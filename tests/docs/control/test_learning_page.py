@@ -1,5 +1,7 @@
 """What the page on learning shows is run here as it stands."""
 
+from pathlib import Path
+
 import pytest
 
 from tests.docs.page import Page
@@ -7,7 +9,10 @@ from tests.docs.page import Page
 PAGE = Page("control/learning.md")
 
 
-def test_the_examples_of_the_page_run(capsys: pytest.CaptureFixture[str]) -> None:
+def test_the_examples_of_the_page_run(
+    capsys: pytest.CaptureFixture[str], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.chdir(tmp_path)
     names: dict[str, object] = {}
     for code in PAGE.python:
         PAGE.execute(code, names)

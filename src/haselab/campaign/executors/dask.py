@@ -130,8 +130,9 @@ class DaskExecutor:
             if address == LOCAL:
                 config = library("dask", _EXTRA).config
                 with config.set({**_LOCAL_CONFIG, **_start_method()}), one_thread():
+                    # Without a host, Dask would serve its status page to the whole network.
                     self._cluster = distributed.LocalCluster(
-                        n_workers=workers, threads_per_worker=1, dashboard_address=":0",
+                        n_workers=workers, threads_per_worker=1, dashboard_address="127.0.0.1:0",
                         silence_logs=logging.CRITICAL,
                     )  # fmt: skip
             self._client = distributed.Client(

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import itertools
+import statistics
 from collections.abc import Iterator, Mapping, Sequence
 
 import numpy as np
@@ -65,8 +66,7 @@ def _summary(values: Floats) -> JsonObject:
     }  # fmt: skip
     if present.size == 0:
         return counts
-    low, high = present[(present.size - 1) // 2], present[present.size // 2]
-    median = low if low == high else low + 0.5 * (high - low)
+    median = statistics.median(present.tolist())  # that of numpy warns of infinities of both signs
     return counts | {
-        "least": float(present[0]), "median": float(median), "largest": float(present[-1]),
+        "least": float(present[0]), "median": median, "largest": float(present[-1]),
     }  # fmt: skip

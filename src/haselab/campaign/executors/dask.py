@@ -48,7 +48,7 @@ def _start_method() -> dict[str, str]:
         return {}
     method = {"distributed.worker.multiprocessing-method": "forkserver"}
     with library("dask", _EXTRA).config.set(method):
-        library("distributed.utils", _EXTRA).get_mp_context()  # sets its list of imports in its first call only
+        library("distributed.utils", _EXTRA).get_mp_context()  # its first call sets other imports
     multiprocessing.set_forkserver_preload(["distributed", compute_cases.__module__])
     return method
 

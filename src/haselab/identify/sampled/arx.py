@@ -457,7 +457,7 @@ def _fit(
 
 
 def _responds(solved: _Solved, orders: ArxOrders, *, white: bool) -> bool:
-    """Whether the output depends on the input, with the delay of largest effect."""
+    """Whether the output depends on the input, if its delay was chosen for the largest effect."""
     if not np.abs(solved.errors).max() > 0.0:
         return True
     covariance = solved.covariance if white else _coloured(solved)

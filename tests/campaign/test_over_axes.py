@@ -75,14 +75,14 @@ WHOLE = math.prod(1.0 + v for v in PARTIAL) - 1.0
 def test_sobol_indices_are_the_published_ones(
     campaigns: Any, function: Any, first: list[float], total: list[float]
 ) -> None:
-    """The half widths, of 95 %, become those of more than 99.9 %: six numbers are compared."""
+    """Twice the half width of 95 % is 3.9 standard deviations; six numbers are compared."""
     plan = campaigns.plan(UNIFORM.format(1024))
     found = summarised(plan, rows_of(plan, function))["sensitivities"]
     assert len(found) == 3
     for one, *true in zip(found, first, total, strict=True):
         for index, share in zip(("first", "total"), true, strict=True):
             low, high = one[index]["ci95"]
-            assert one[index]["value"] == pytest.approx(share, abs=(high - low))
+            assert one[index]["value"] == pytest.approx(share, abs=high - low)
             assert high - low < 0.2
 
 

@@ -145,6 +145,14 @@ def test_infinities_of_both_signs_have_no_mean_and_no_warning(campaigns: Any) ->
     assert math.isnan(found["mean"]) and found["least"] == -math.inf
 
 
+def test_a_median_between_a_number_and_an_infinity_is_the_infinity(campaigns: Any) -> None:
+    plan = campaigns.plan(GRID)
+    for infinity in (-math.inf, math.inf):
+        rows = rows_of(plan, lambda gain, delay, end=infinity: gain if delay == 0.0 else end)
+        found = {tuple(one["axes"]): one["points"] for one in summarised(plan, rows)["over_axes"]}
+        assert [point["median"] for point in found["case.gain",]] == [infinity] * 3
+
+
 def test_cases_with_the_same_draws_are_compared_in_pairs(campaigns: Any) -> None:
     """The devices differ by 10 and the change is 0.1: only the pairs show it."""
     text = campaigns.quick.replace("samples = 8", "samples = 16").replace("[0.01, 0.02]", "[0.01]")

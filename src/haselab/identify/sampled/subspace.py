@@ -180,7 +180,7 @@ def fit_subspace(
     elif not _responds(model, inputs, residuals):
         status = (
             f"no result: with {count} states, the output shows no response to the input; check the "
-            "columns and the sensor, or change the order"
+            "columns and the sensor, change the order, or record longer"
         )
     if status:
         none = Estimate(math.nan, math.inf, (-math.inf, math.inf), "")

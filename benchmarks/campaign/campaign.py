@@ -4,8 +4,8 @@
 
 A case identifies a virtual device: parameters drawn, its record simulated in C and fitted. T1 is
 the time of one process. All times include the start of the workers, except for a running scheduler,
-whose two workers wait for the command, as on a cluster. With repeats, the shortest time of each
-counts, because the speed of a shared computer changes within minutes.
+whose two workers wait for the command, as on a cluster. With --repeats, the shortest time of each
+kind of campaign counts, because the speed of a shared computer changes within minutes.
 """
 
 from __future__ import annotations
@@ -51,7 +51,7 @@ case.delay_s = {{ uniform = [0.0, 0.03] }}
 kind = "latin-hypercube"
 samples = {cases}
 """
-# of docs/study/campaign.md, "On a cluster"
+# Those that docs/study/campaign.md, "On a cluster", recommends.
 SETTINGS = {
     "DASK_DISTRIBUTED__WORKER__PROFILE__ENABLED": "False",
     "DASK_DISTRIBUTED__WORKER__MEMORY__MONITOR_INTERVAL": "2s",
@@ -181,7 +181,7 @@ def rows(cases: int = CASES, finished: int = FINISHED, repeats: int = 1) -> Iter
             yield Row(f"T1 / (2 T2), {what}", share, "", 0.9, note=f"{about}, {load}")
             own_s = 1e3 * found.own_s / cases
             yield Row(f" of this program, {what}", own_s, "ms/case")
-        # what all programs take together, so that others on the computer do not matter
+        # The time of all processes together does not depend on other programs on the computer.
         share = one.workers_s / (two.own_s + two.workers_s)
         yield Row("T1 / (2 T2) by processor time, 2 processes", share, "", 0.9)
         finished_by = {name: finished_rows(plan, folder / name) for name in ("two", "dask")}

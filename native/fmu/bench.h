@@ -70,7 +70,7 @@ const char *fmu_message(const fmu_bench *b);
 
 void fmu_reset(fmu_bench *b);
 
-/* Ends the simulation: each further step is an error until a reset or a restored state. */
+/* Ends the simulation: a step is then an error, until a reset or until a state is restored. */
 void fmu_terminate(fmu_bench *b);
 fmu_status fmu_start(fmu_bench *b, double time_s);
 fmu_status fmu_enter(fmu_bench *b); /* the initialisation; starts at 0 s if no start was set */

@@ -22,7 +22,7 @@ typedef struct {
 
 typedef struct {
     int64_t place;
-    double start, low, high; /* a smallest positive `low`: more than 0 */
+    double start, low, high; /* smallest positive `low`: the value must be above 0 */
     char name[FMU_NAME];
 } fmu_record;
 
@@ -44,7 +44,7 @@ struct fmu_memory {
     int32_t pending, first_pending;
     fmu_change queue[FMU_PENDING];
     double sensed_f, sensed_ohm, v_reading_v, i_reading_v;
-    int32_t sensed_valid, initialised, terminated, unused;
+    int32_t sensed_valid, initialised, terminated, unused; /* `unused` aligns the parameters */
     double parameter[]; /* then the last readings of both monitors: floats of a block each */
 };
 

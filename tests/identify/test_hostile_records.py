@@ -69,7 +69,7 @@ def test_steps_of_a_converter_and_exact_limits_of_a_simulation_are_not_clipping(
 @pytest.mark.parametrize("seed", range(5))
 def test_an_equation_whose_output_is_noise_has_no_result(seed):
     noise = np.random.default_rng(seed).standard_normal(TIME_S.size)
-    assert "does not respond to the input" in fit_arx(Record.sampled(U, noise, 100.0)).status
+    assert "shows no response to the input" in fit_arx(Record.sampled(U, noise, 100.0)).status
     # 10 standard deviations of a gain that 1,500 samples of unit noise and this input give
     weak = noise + 10.0 / np.sqrt(U.size * U.var()) * np.r_[0.0, U[:-1]]
     assert fit_arx(Record.sampled(U, weak, 100.0)).status == "ok"
@@ -84,14 +84,14 @@ def test_an_equation_whose_output_is_coloured_noise_has_no_result(noise):
         "walk": np.cumsum(white) + 5.0 * white[::-1],
     }[noise]
     v *= np.std(Y) / np.std(v)
-    assert "does not respond to the input" in fit_arx(Record.sampled(U, v, 100.0)).status
+    assert "shows no response to the input" in fit_arx(Record.sampled(U, v, 100.0)).status
     # as large as the signal, it does not hide the response
     assert fit_arx(Record.sampled(U, Y + v, 100.0)).status == "ok"
     alone = fit_subspace(Record.sampled(U, v, 100.0), bootstrap=0)
-    if noise == "hum":  # its poles explain it, so only the note can say what it is
-        assert any("at 12.57 Hz hardly decays" in note for note in alone.notes)
+    if noise == "hum":  # poles of the model explain it, so it is only named in a note
+        assert any("at 12.57 Hz keeps more than 10 %" in note for note in alone.notes)
     else:
-        assert "no response of the output to the input is seen" in alone.status
+        assert "the output shows no response to the input" in alone.status
     assert fit_subspace(Record.sampled(U, Y + v, 100.0), 2, bootstrap=0).status == "ok"
 
 

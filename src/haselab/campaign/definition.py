@@ -95,8 +95,8 @@ class Campaign:
         axes: fully crossed.
         distributions: drawn by the design.
         design: of the points.
-        time_limit_s: of a case; None: there is none. It does not belong to what a case is, so that
-            it can be changed before failed cases are computed again.
+        time_limit_s: of a case; None: no limit. The hash of a case does not include it, so it can
+            be changed before failed cases are computed again.
     """
 
     name: str
@@ -133,7 +133,7 @@ class Campaign:
         return axes * self.points * self.design.repeats
 
     def described(self) -> JsonObject:
-        """All that determines the results but the time limit, as JSON types."""
+        """All that determines the results, except for the time limit, as JSON types."""
         return {
             "name": self.name,
             "kind": self.kind,

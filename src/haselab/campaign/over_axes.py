@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import itertools
+import statistics
 from collections.abc import Iterator, Mapping, Sequence
 
 import numpy as np
@@ -15,29 +16,29 @@ from haselab.store.campaign.shards import CaseRow
 __all__ = ["over_axes"]
 
 Floats = NDArray[np.float64]
-_MOST_POINTS = 400  # of a crossed table
+_MOST_POINTS = 400  # of a table over two axes
 
 
 def over_axes(
     campaign: Campaign, rows: Sequence[CaseRow], values: Mapping[str, Floats]
 ) -> Iterator[JsonObject]:
-    """Summarise each result at each value of an axis, over all values of the others.
+    """Summarise each result at each value of an axis, over all values of the other axes.
 
-    Two axes with few values are crossed, too.
+    If exactly two axes vary, it is also summarised at each pair of their values, up to 400 pairs.
 
     Args:
         campaign: of the rows.
         rows: of all its cases.
         values: results of these cases by name; NaN where there is none. Shape `(N,)` each.
-    Returns:
-        For each result and one or two axes: for each of their points the number of cases with a
-        value, without one, and the smallest, the median and the largest value. One-element axes do
-        not count.
+    Yields:
+        One result over one axis or two: for each of their points the number of cases with a value
+        and of those without, and the smallest, the median and the largest value. Axes with a
+        single value are left out.
     """
     varied = [axis for axis in campaign.axes if len(axis.values) > 1]
-    chosen = [(axis,) for axis in varied]
+    chosen: list[tuple[Axis, ...]] = [(axis,) for axis in varied]
     if len(varied) == 2 and len(varied[0].values) * len(varied[1].values) <= _MOST_POINTS:
-        chosen.append((varied[0], varied[1]))  # type: ignore[arg-type]
+        chosen.append(tuple(varied))
     for axes in chosen:
         places = _places(axes, rows)
         for name in values:
@@ -49,7 +50,7 @@ def over_axes(
 
 
 def _places(axes: Sequence[Axis], rows: Sequence[CaseRow]) -> dict[tuple[Json, ...], list[int]]:
-    """Places of the rows at each point of some axes."""
+    """Indices of the rows at each point of some axes."""
     found: dict[tuple[Json, ...], list[int]] = {
         point: [] for point in itertools.product(*(axis.values for axis in axes))
     }
@@ -65,8 +66,7 @@ def _summary(values: Floats) -> JsonObject:
     }  # fmt: skip
     if present.size == 0:
         return counts
-    low, high = present[(present.size - 1) // 2], present[present.size // 2]
-    median = low if low == high else low + 0.5 * (high - low)
+    median = statistics.median(present.tolist())  # that of numpy warns of infinities of both signs
     return counts | {
-        "least": float(present[0]), "median": float(median), "largest": float(present[-1]),
+        "least": float(present[0]), "median": median, "largest": float(present[-1]),
     }  # fmt: skip

@@ -23,13 +23,15 @@ __all__ = ["Progressed", "run_cases"]
 # Computing time of a chunk, so that the time between two is small against it; and so much of it for
 # each worker, because this program takes about 10 ms for each chunk of any worker.
 _CHUNK_S, _CHUNK_S_FOR_EACH = 1.0, 0.02
-_LEAST_S = 0.1  # of a chunk at the end
+_LAST_CHUNK_S = 0.1  # least computing time of a chunk at the end
 _MOST_IN_CHUNK = 2000
 _AHEAD = 2  # chunks for each worker: one in work and one that waits
 _BLOCKS = 1000  # into which the cases are divided for claims
 _MOST_DEATHS = 4  # of workers that computed the same case
 _WAIT_S = 1.0
-_LONG_S, _LONG = 30.0, 10.0  # a case that is mentioned: its time, and that over the mean one
+# A stop names a case that has been running for longer than both this time and this multiple of the
+# mean time of a case.
+_LONG_S, _LONG_MULTIPLE = 30.0, 10.0
 
 
 @dataclass(frozen=True)
@@ -153,10 +155,10 @@ class _Run:
     def _explained(
         self, stop: DeviceError | KeyboardInterrupt, running: tuple[Job, float] | None
     ) -> BaseException:
-        """The error with what is kept, and with a case that may never end."""
+        """The error with a note of what is kept, and of a case that may never end."""
         done = f"{self._finished():,} of {self._plan.count:,} cases are finished and kept"
         note = f"{done}; the same command continues."
-        if running is not None and running[1] > max(_LONG_S, _LONG * self._each_s):
+        if running is not None and running[1] > max(_LONG_S, _LONG_MULTIPLE * self._each_s):
             note += (
                 f" Case {running[0].index} had been running for {running[1]:.0f} s; if cases may "
                 "never end, set time_limit_s in the campaign file."
@@ -221,11 +223,11 @@ class _Run:
         return self._waiting(block)
 
     def _chunk_size(self, workers: int) -> int:
-        """Cases that take a second or more; down to 0.1 s at the end, so that all end together."""
+        """Cases that take a second or more; at the end less, so that all workers end together."""
         if self._each_s == 0.0:
             return 1
         left = len(self._queue) + sum(len(self._left[block]) for block in self._blocks)
-        share = max(round(_LEAST_S / self._each_s), left // (2 * _AHEAD * workers))
+        share = max(round(_LAST_CHUNK_S / self._each_s), left // (2 * _AHEAD * workers))
         wanted_s = max(_CHUNK_S, _CHUNK_S_FOR_EACH * workers)
         return max(1, min(round(wanted_s / self._each_s), share, _MOST_IN_CHUNK))
 

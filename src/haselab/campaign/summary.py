@@ -33,9 +33,10 @@ _SIDE = 0.025
 _OF_ESTIMATES = (".std", ".low", ".high", ".true")
 _MOST_GROUPS = 24
 _RESAMPLED = 1000
-# Intervals of Sobol indices from resampling 8 or 16 blocks contained the known total indices of the
-# Ishigami function in only 68 to 75 % of simulated campaigns; those of 64 blocks in 95 % or more.
-_LEAST_RESAMPLED = 64
+# Sample blocks that an interval of a Sobol index needs. Intervals from 8 or 16 blocks contained the
+# known total indices of the Ishigami function in only 68 to 75 % of simulated campaigns; those from
+# 64 blocks in 95 % or more.
+_LEAST_BLOCKS = 64
 _SEED = 1  # of resampling: the same rows give the same intervals
 LEAST_CASES = 8
 
@@ -151,7 +152,7 @@ def summarised(plan: Plan, rows: Sequence[CaseRow]) -> JsonObject:
 
 
 def _over_axes(campaign: Campaign, groups: Sequence[Group], names: Sequence[str]) -> list[Json]:
-    """Results over the axes; none if each point of the axes has distributions of its own."""
+    """Results over the axes; none if each point of the axes has its own distributions."""
     if len(groups) > 1:
         return []
     values = {name: groups[0].values(name) for name in names}
@@ -322,8 +323,8 @@ def _sobol_indices(group: Group, name: str, paths: Sequence[str]) -> list[JsonOb
 
 
 def _around(value: float, half: float, blocks: int) -> JsonObject:
-    """A number with its interval, if there are blocks enough to trust it."""
-    ends = [float(value - half), float(value + half)] if blocks >= _LEAST_RESAMPLED else None
+    """A number with its interval, if there are enough blocks to trust it."""
+    ends = [float(value - half), float(value + half)] if blocks >= _LEAST_BLOCKS else None
     return {"value": float(value), "ci95": ends}
 
 
@@ -454,7 +455,7 @@ def compared(
 
 
 def share_cases(here: Mapping[str, Any], there: Mapping[str, Any]) -> bool:
-    """Whether the cases of two campaigns have the same drawn values and random numbers, in pairs.
+    """Whether cases of the same index in two campaigns have the same draws and random numbers.
 
     Args:
         here: one campaign, as in its campaign.json.
@@ -474,8 +475,8 @@ def paired(
         there: results of all cases of the other one, by name.
         independent: the cases are independent draws.
     Returns:
-        For each result that both have: the number of cases with a finite value in both and of those
-        without, and the smallest, the median and the largest difference, here less there.
+        For each result of both: the number of cases with a finite value in both, the number of the
+        others, and the smallest, the median and the largest difference (here minus there).
     """
     group, found = Group("", tuple(here)), list[Json]()
     for name in result_names(here):

@@ -100,6 +100,6 @@ def _columns(name: str, value: Any) -> dict[str, Json]:
             name: float(value.value), f"{name}.std": float(value.std),
             f"{name}.low": float(low), f"{name}.high": float(high),
         }  # fmt: skip
-    if isinstance(value, (str, bytes)):  # float() would read a number in it
+    if isinstance(value, (str, bytes)):  # float("7") is a number
         raise TypeError(f"the result {name!r} is the text {shown(value)}, not a number")
     return {name: float(value)}

@@ -52,8 +52,8 @@ def default_step(plant: AnyPlant, limits: Saturation) -> float:
         plant: plant.
         limits: of the controller's output.
     Returns:
-        0.04; where the limits do not allow that, half of the larger step that they allow, in the
-        direction of it, which is upwards if both are equal.
+        0.04 if the limits allow it. Otherwise half of the largest step that they allow, upwards or
+        downwards; upwards if both are equally large.
     Example:
         >>> plant = Plant(0.8, 60.0, 0.2)
         >>> default_step(plant, Saturation()), default_step(plant, Saturation(-0.02, 0.015))

@@ -43,7 +43,7 @@ def clipping_of(values: ArrayLike, what: str) -> str:
         if others.size > _FEWEST and _is_noisy(others):
             return (
                 f"{count} of the {found.size} {what} are exactly {end:.6g}, the end of their "
-                "range, although the others are noisy: they are clipped, or filled in. Leave "
+                "range, although the others are noisy: they are clipped or filled in. Leave "
                 "them out, or record with a larger range"
             )
     return ""

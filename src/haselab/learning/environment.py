@@ -39,13 +39,12 @@ def actions_of(action: object, count: int) -> NDArray[np.float64]:
         action: of a policy.
         count: number of loops.
     Raises:
-        InputError: They are not numbers, or not as many.
+        InputError: They are not numbers, or not one for each loop.
     """
     found = np.asarray(action)
-    # one number may have any shape; of several, another shape is a mistake of the caller
-    shapes = [(count,), (count, 1)]
-    alright = found.size == count and (count == 1 or found.shape in shapes)
-    if found.dtype.kind not in "iuf" or not alright:
+    # A single number may have any shape. Several in another shape, such as (2, 2), are a mistake.
+    fits = found.size == count and (count == 1 or found.shape in [(count,), (count, 1)])
+    if found.dtype.kind not in "iuf" or not fits:
         raise InputError(
             f"The action is {shown(action)}. State {count} "
             f"{'number' if count == 1 else 'numbers'} from -1 to 1."
@@ -93,8 +92,8 @@ class StrainEnv(gymnasium.Env[NDArray[np.float32], NDArray[np.float32]]):
         """Begin an episode, see `gymnasium.Env.reset`.
 
         Args:
-            seed: of this episode and the next ones; None: they continue.
-            options: none are known.
+            seed: of this episode and the next ones; None: the random numbers continue.
+            options: not used.
         Raises:
             InputError: The seed is not a whole number of 0 or more.
         """

@@ -118,7 +118,7 @@ class StrainSimulation:
         self._reach = _reach(self._pool)
 
     def __reduce__(self) -> tuple[object, ...]:
-        """Refuse to be copied or pickled in words that name the remedy.
+        """Refuse copies and pickles, with a message that says what to do instead.
 
         Raises:
             TypeError: always.

@@ -90,8 +90,8 @@ def motions_of_session(
     Args:
         reader: of the session, open.
         path: of the session, for messages.
-        lockins: see `motion_of_session`; each with what it has sensed before, by the recording's
-            name.
+        lockins: see `motion_of_session`; each with what it has already sensed, by the name of the
+            recording. Recordings that are not in it are sensed.
     Returns:
         One motion for each.
     Raises:

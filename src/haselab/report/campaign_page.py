@@ -178,9 +178,9 @@ def _tables(summary: Mapping[str, Any]) -> Iterator[_Table]:
     )
     yield _Table(
         "Comparison case by case",
-        f"This campaign less that in {summary.get('compared_with', '')}. Both have the same drawn "
-        "values and random numbers, so each case has a partner, and differences between the "
-        "devices cancel. Cases without a finite value in both are left out. "
+        f"This campaign minus that in {summary.get('compared_with', '')}. A case has the same "
+        "drawn values and random numbers in both, so differences between the devices cancel. "
+        "Cases without a finite value in both are left out. "
         f"{_differences(summary.get('differs_in', ()))}",
         ("Result", "Cases", "Left out", "Smallest difference", "Median difference",
          "Largest difference"),
@@ -193,7 +193,7 @@ def _tables(summary: Mapping[str, Any]) -> Iterator[_Table]:
 
 
 def _over(found: Sequence[Mapping[str, Any]]) -> Iterator[_Table]:
-    """Tables of the results over each axis, and over two axes."""
+    """Tables of the results over each axis, and over both if there are two."""
     by_axes: dict[tuple[str, ...], list[Mapping[str, Any]]] = {}
     for one in found:
         by_axes.setdefault(tuple(one["axes"]), []).append(one)
@@ -209,11 +209,11 @@ def _over_one(path: str, results: Sequence[Mapping[str, Any]], count: int) -> _T
     more = "" if len(points) <= _MOST_VALUES else (
         f" The first {_MOST_VALUES} of {len(points)} values; summary.json has all."
     )  # fmt: skip
-    more += "" if count == len(results) else f" {len(results)} of {count} results."
+    more += "" if count == len(results) else f" The first {len(results)} of {count} results."
     return _Table(
         f"Results over {path}",
-        "Median of the cases at each value, over all values of the other parameters; in brackets "
-        f"the smallest and the largest, which are no interval of 95 %.{more}",
+        "Median of the cases at each value, over all values of the other parameters; in "
+        f"parentheses the smallest and the largest result (not a 95 % interval).{more}",
         (path, "Cases", *(one["result"] for one in results)),
         [
             (_shown(point["at"][0]), str(point["count"] + point["without_value"]),
@@ -246,7 +246,10 @@ def _spread(point: Mapping[str, Any], *, spread: bool = True) -> str:
 
 
 def _figures_over(found: Sequence[Mapping[str, Any]]) -> Iterator[str]:
-    """Medians over one numeric axis, or over the first of two with a curve for some values."""
+    """Medians over a numeric axis; of two axes over the first, with one curve for each value.
+
+    Only the first `_MOST_CURVES` values have a curve.
+    """
     crossed = [one for one in found if len(one["axes"]) == 2]
     for number, one in enumerate((crossed or found)[:_MOST_FIGURES]):
         first = [point["at"][0] for point in one["points"]]

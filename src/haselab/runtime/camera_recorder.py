@@ -95,11 +95,11 @@ class _Particles:
         found = found[(found[:, 1] > low) & (found[:, 1] < high)][:PARTICLES]
         self._count = len(found)
         if self._count:
-            alone = TrackOptions(subset_px=15, model="affine")
+            by_itself = TrackOptions(subset_px=15, model="affine")
             try:
-                self._tracker = PointTracker(found, replace(alone, model="neighbours"))
+                self._tracker = PointTracker(found, replace(by_itself, model="neighbours"))
             except InputError:  # fewer than six particles, or all on one line
-                self._tracker = PointTracker(found, alone)
+                self._tracker = PointTracker(found, by_itself)
             self._state = self._tracker.init(list(images))
 
     def follow(self, frames: Frames, mass_kg: float) -> None:
@@ -118,7 +118,7 @@ class _Particles:
 
 
 def _count_at_rest(images: NDArray[np.uint8], points: NDArray[np.float64]) -> int:
-    """Number of frames before the first motion of the points, which would blur the mean."""
+    """Number of frames before the points first move; later frames would blur the mean."""
     tracker = PointTracker(points, _OPTIONS)
     state = tracker.init([images[0]])
     for count, image in enumerate(images[1:], start=1):
@@ -231,7 +231,7 @@ class CameraRecorder:
             write_png(self._folder / f"{self._name}.png", images[0])
 
     def _at_rest(self, images: NDArray[np.uint8]) -> NDArray[np.uint8]:
-        """The frames before the first motion; fewer than all are noted in the session."""
+        """The frames before the first motion; an event in the session says if motion left fewer."""
         try:
             points = self._call(_fiducials_of, images[:1])
         except ResultError:  # too noisy; the mean of all frames may be good enough

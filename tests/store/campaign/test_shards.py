@@ -108,7 +108,7 @@ def test_a_program_of_another_computer_has_its_claims_until_it_gives_no_sign_of_
 def test_without_locks_two_programs_of_one_computer_respect_each_other(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """Else the second takes the first for one that has ended, and computes all cases again."""
+    """Otherwise the second program takes the first for ended, and computes all cases again."""
 
     def refuses(descriptor: int) -> None:
         raise OSError(errno.ENOLCK, "No locks available")

@@ -37,18 +37,18 @@ _LOCAL_CONFIG = {
     "distributed.worker.memory.monitor-interval": "2s",
     "distributed.admin.tick.interval": "1s",
     "distributed.admin.system-monitor.interval": "5s",
-    # Ctrl-C reaches all programs of a terminal, and is for the one that started the cluster.
+    # Ctrl-C reaches all programs of a terminal; only the one that started the cluster handles it.
     "distributed.worker.preload": ["import signal; signal.signal(signal.SIGINT, signal.SIG_IGN)"],
 }
 
 
 def _start_method() -> dict[str, str]:
-    """Start workers as copies of one process that has imported all; where the system can do so."""
+    """Setting that starts workers as copies of one process with all imports, where possible."""
     if "forkserver" not in multiprocessing.get_all_start_methods():
         return {}
     method = {"distributed.worker.multiprocessing-method": "forkserver"}
     with library("dask", _EXTRA).config.set(method):
-        library("distributed.utils", _EXTRA).get_mp_context()  # sets a list of imports, once
+        library("distributed.utils", _EXTRA).get_mp_context()  # its first call sets other imports
     multiprocessing.set_forkserver_preload(["distributed", compute_cases.__module__])
     return method
 
@@ -63,7 +63,7 @@ def _silence() -> None:
 # ---- on a worker -------------------------------------------------------------------------------
 
 # A thread of a Dask worker cannot be killed. With a time limit, each thread therefore has a process
-# that computes its cases, kept for the next chunks.
+# that computes its cases and is kept for the next chunks.
 _limited: dict[int, tuple[Problem, float, ProcessExecutor]] = {}
 _changing = threading.Lock()
 
@@ -81,7 +81,7 @@ def _compute_limited(problem: Problem, jobs: Sequence[Job], limit_s: float) -> l
 
 
 def _limited_executor(problem: Problem, limit_s: float) -> ProcessExecutor:
-    """The process of this thread."""
+    """The executor of this thread, with one process."""
     own = threading.get_ident()
     with _changing:
         old = _limited.pop(own, None)
@@ -114,7 +114,7 @@ class DaskExecutor:
         problem: what all cases share.
         address: of the scheduler; `local`: start a cluster on this computer.
         workers: processes of a local cluster.
-        limit_s: time of a case; None: any time.
+        limit_s: time of a case, after which it is stopped; None: no limit.
     Raises:
         InputError: Dask is not installed, or there is no scheduler at the address.
     """
@@ -130,8 +130,9 @@ class DaskExecutor:
             if address == LOCAL:
                 config = library("dask", _EXTRA).config
                 with config.set({**_LOCAL_CONFIG, **_start_method()}), one_thread():
+                    # Without a host, Dask would serve its status page to the whole network.
                     self._cluster = distributed.LocalCluster(
-                        n_workers=workers, threads_per_worker=1, dashboard_address=":0",
+                        n_workers=workers, threads_per_worker=1, dashboard_address="127.0.0.1:0",
                         silence_logs=logging.CRITICAL,
                     )  # fmt: skip
             self._client = distributed.Client(

@@ -30,8 +30,8 @@ class Outcome:
 
     Args:
         chunk: that was submitted.
-        rows: of its cases, perhaps not all: the others are computed again. None: the worker ended
-            before.
+        rows: of its cases; cases without a row are computed again. None: the worker ended before
+            it returned any.
         blamed: whether the worker may have ended because of these cases.
     """
 

@@ -28,8 +28,8 @@ __all__ = ["ProcessExecutor"]
 
 _MOST_STARTS = 5  # in a row without one that became ready
 _END_S = 2.0
-_LOOKS = 8  # at the running cases, in each time limit
-_SPARE_S = 10.0  # beyond the limit, until a process that nobody watches any more ends by itself
+_CHECKS = 8  # of the running cases, per time limit
+_ORPHAN_S = 10.0  # beyond the time limit: then a process whose parent was killed ends by itself
 
 
 @dataclass(frozen=True)
@@ -38,7 +38,7 @@ class _Running:
 
     Args:
         chunk: number of the chunk that it belongs to.
-        place: in the chunk.
+        place: index of the case in the chunk.
         since_s: when it began, on the monotonic clock of the computer.
     """
 
@@ -48,14 +48,14 @@ class _Running:
 
 
 class _Stamp:
-    """Memory that a process shares with its parent, in which it keeps what it computes."""
+    """Memory that a process shares with its parent, in which it notes the case it computes."""
 
     def __init__(self) -> None:
         self._numbers = multiprocessing.get_context("spawn").RawArray("d", 3)
 
     def begin(self, chunk: int, place: int) -> None:
         """Note the case that begins now."""
-        self._numbers[2] = 0.0  # a reader sees an old case, none, or the new one; never a mixture
+        self._numbers[2] = 0.0  # so that no reader takes a mixture of the old and the new case
         self._numbers[0], self._numbers[1] = float(chunk), float(place)
         self._numbers[2] = time.monotonic()
 
@@ -64,7 +64,7 @@ class _Stamp:
         self._numbers[2] = 0.0
 
     def read(self) -> _Running | None:
-        """The running case; None: there is none, or it changes just now."""
+        """The running case; None: there is none, or it is just changing."""
         since_s = self._numbers[2]
         chunk, place = int(self._numbers[0]), int(self._numbers[1])
         return _Running(chunk, place, since_s) if since_s == self._numbers[2] != 0.0 else None
@@ -93,7 +93,7 @@ class ProcessExecutor:
     Args:
         problem: what all cases share.
         workers: number of processes.
-        limit_s: time of a case, after which its process is killed; None: any time.
+        limit_s: time of a case, after which its process is killed; None: no limit.
     """
 
     def __init__(self, problem: Problem, workers: int, limit_s: float | None = None) -> None:
@@ -120,7 +120,7 @@ class ProcessExecutor:
             DeviceError: the processes end at their start, or one cannot compute any case.
         """
         if self._limit_s is not None:
-            longest_s = min(longest_s, self._limit_s / _LOOKS)
+            longest_s = min(longest_s, self._limit_s / _CHECKS)
         ready = wait([worker.pipe for worker in self._workers], longest_s)
         found: list[Outcome] = []
         for place, worker in enumerate(self._workers):
@@ -135,7 +135,7 @@ class ProcessExecutor:
         return found
 
     def longest(self) -> tuple[Job, float] | None:
-        """The case that is running for the longest time, and this time in s; None: none runs."""
+        """The case that has been running for the longest time, and this time in s; None: none."""
         found = [
             (chunk.jobs[running.place], time.monotonic() - running.since_s)
             for worker in self._workers
@@ -144,21 +144,22 @@ class ProcessExecutor:
         return max(found, key=lambda each: each[1], default=None)
 
     def _late_case(self, worker: _Worker) -> _Running | None:
-        """The running case of a process if it takes longer than the limit."""
+        """The running case of a process if it has exceeded the time limit."""
         running = worker.stamp.read()
         if running is None or self._limit_s is None:
             return None
         return running if time.monotonic() - running.since_s > self._limit_s else None
 
     def _ended_late(self, place: int, running: _Running) -> list[Outcome]:
-        """Kill a process and start another; the case that it was computing has failed."""
+        """Kill a process and start another; the case that it was computing fails."""
         worker = self._workers[place]
         spent_s = time.monotonic() - running.since_s
         worker.process.kill()
         worker.process.join()
-        found = self._received(worker) or []  # of the chunks before
-        ended_before = worker.stamp.read() != running
-        if not ended_before and (chunk := worker.given.pop(running.chunk, None)):
+        found = self._received(worker) or []  # chunks that ended before the kill
+        # A case that ended just before the kill has not failed: its chunk is computed again.
+        still_ran = worker.stamp.read() == running
+        if still_ran and (chunk := worker.given.pop(running.chunk, None)):
             found.append(Outcome(chunk, [_late(chunk.jobs[running.place], self._limit_s, spent_s)]))
         waiting = [Outcome(chunk, []) for chunk in worker.given.values()]
         worker.pipe.close()
@@ -252,9 +253,9 @@ def _stamped(
     for place, job in enumerate(jobs):
         stamp.begin(number, place)
         if limit_s is not None and hasattr(signal, "setitimer"):
-            # The parent kills a case that takes too long. If the parent has been killed itself, a
-            # case that hangs in compiled code keeps the thread below from ending this process.
-            signal.setitimer(signal.ITIMER_REAL, limit_s + _SPARE_S)
+            # The parent kills a case that takes too long. If the parent was killed itself, a case
+            # that hangs in compiled code may keep `_receive` from ending this process.
+            signal.setitimer(signal.ITIMER_REAL, limit_s + _ORPHAN_S)
         yield job
     if limit_s is not None and hasattr(signal, "setitimer"):
         signal.setitimer(signal.ITIMER_REAL, 0.0)

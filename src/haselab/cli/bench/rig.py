@@ -105,7 +105,7 @@ def _mock(file: RigFile, path: Path) -> Iterator[CheckResult]:
 
 
 def _drivers(file: BenchConfig) -> CheckResult:
-    """Whether the drivers of all instruments are installed; all that are missing, not the first."""
+    """Check the drivers of all instruments, and name each that is missing."""
     drivers: list[str] = []
     missing: list[str] = []
     for found in file.instruments():

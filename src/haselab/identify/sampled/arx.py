@@ -424,7 +424,8 @@ def _fit(
         status, covariance = _with_bias(solved, u, y, orders, rate_hz, whiteness)
     if status == "ok" and not _responds(solved, orders, white=whiteness >= _WHITE):
         status = (
-            "no result: the output does not respond to the input; check the columns and the sensor"
+            "no result: the output shows no response to the input; check the columns and the "
+            "sensor, or record longer"
         )
     names = [f"a_{i + 1}" for i in range(orders.na)] + [f"b_{i + 1}" for i in range(orders.nb)]
     std = np.sqrt(np.maximum(np.diag(covariance), 0.0))
@@ -457,7 +458,7 @@ def _fit(
 
 
 def _responds(solved: _Solved, orders: ArxOrders, *, white: bool) -> bool:
-    """Whether the output depends on the input, with the delay of largest effect."""
+    """Whether the output depends on the input, if its delay was chosen for the largest effect."""
     if not np.abs(solved.errors).max() > 0.0:
         return True
     covariance = solved.covariance if white else _coloured(solved)

@@ -38,8 +38,8 @@ Complexes = NDArray[np.complex128]
 _MOST_ORDER = 10
 _LEAST_GAP = 1e-12
 _WHITE = 0.05
-_LASTS = 0.1  # share of an oscillation that is left at the end of the record
-_MOST = 1e100  # of an output, whose square is summed
+_LASTING = 0.1  # share of its amplitude above which an oscillation is still there at the end
+_LARGEST = 1e100  # output of a growing model, so that its square does not overflow
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -179,8 +179,8 @@ def fit_subspace(
         status = f"no result: the data do not support {count} states; lower the order"
     elif not _responds(model, inputs, residuals):
         status = (
-            f"no result: with {count} states, no response of the output to the input is seen; "
-            "check the columns and the sensor, or change the order"
+            f"no result: with {count} states, the output shows no response to the input; check the "
+            "columns and the sensor, change the order, or record longer"
         )
     if status:
         none = Estimate(math.nan, math.inf, (-math.inf, math.inf), "")
@@ -254,7 +254,7 @@ def _model(u: Floats, y: Floats, space: Floats, rate_hz: float) -> tuple[StateSp
     a = np.asarray(shift, dtype=np.float64)
     size = a.shape[0]
     frame = StateSpaceModel(a, np.zeros(size), space[0], 0.0, rate_hz)
-    columns = _columns(frame, u)
+    columns = _regressors(frame, u)
     if columns is None:
         return frame, np.zeros(y.size)
     scale = np.sqrt((columns**2).sum(axis=0))
@@ -264,16 +264,16 @@ def _model(u: Floats, y: Floats, space: Floats, rate_hz: float) -> tuple[StateSp
     return model, np.asarray(columns @ numbers)
 
 
-def _columns(model: StateSpaceModel, u: Floats) -> Floats | None:
-    """Outputs by each of b, d and the initial states, `(N, 2 n + 1)`; None: they grow too far."""
+def _regressors(model: StateSpaceModel, u: Floats) -> Floats | None:
+    """Outputs for each of b, d and the initial states, `(N, 2 n + 1)`; None: they grow too far."""
     driven, free = model.responses(u)
     columns = np.column_stack([driven, u, free])
-    return columns if np.abs(columns).max() < _MOST else None
+    return columns if np.abs(columns).max() < _LARGEST else None
 
 
 def _responds(model: StateSpaceModel, u: Floats, residuals: Floats) -> bool:
-    """Whether b and d, at these poles, are not by chance."""
-    columns = _columns(model, u)
+    """Whether b and d, for these poles, are larger than noise explains."""
+    columns = _regressors(model, u)
     if columns is None or not np.abs(residuals).max() > 0.0:
         return True
     size = model.b.size + 1
@@ -372,12 +372,12 @@ def _notes(model: StateSpaceModel, whiteness: float, samples: int) -> tuple[str,
     notes = []
     if not model.is_stable:
         notes.append("The model is unstable; lower the order, or record longer.")
-    lasting = model.poles[(np.abs(model.poles) ** samples > _LASTS) & (model.poles.imag > 0.0)]
+    lasting = model.poles[(np.abs(model.poles) ** samples > _LASTING) & (model.poles.imag > 0.0)]
     if lasting.size:
         shown = ", ".join(f"{one:.4g}" for one in np.angle(lasting) * model.rate_hz / (2.0 * np.pi))
         notes.append(
-            f"An oscillation at {shown} Hz hardly decays within the record. It may be hum rather "
-            "than the actuator."
+            f"An oscillation at {shown} Hz keeps more than {100.0 * _LASTING:g} % of its amplitude "
+            "until the end of the record. It may be hum. Check the wiring, or record longer."
         )
     if whiteness < _WHITE:
         notes.append(

@@ -298,9 +298,9 @@ def fit_transfer(
         applied: whether the inputs are known to have been applied as recorded, by the same clock:
             a clipped or slew-limited input and a drifting clock are then not considered as causes.
         near: fit of the same structure to almost the same records: the search starts there alone,
-            ends nearer to the minimum, and looks for no other. If that fit excludes no output
-            and `applied` is true, no spikes and clipped outputs are looked for. None, or one
-            without a result: no such fit is known.
+            ends nearer to the minimum, and looks for no other. If `near` excludes no output and
+            `applied` is true, spikes and clipped outputs are not searched for. None, or a fit
+            without a result: the search starts anew.
     Returns:
         The fit; `status` says "ok" or why there is no result.
     Raises:
@@ -398,8 +398,9 @@ def _fit(
     if not tried:
         return _no_result(layout, "no stable model found; record longer, or fit fewer poles")
     best = min(tried, key=lambda entry: entry.found.cost)
-    if applied and near is not None and near.succeeded and _count(near.records) == _count(records):
-        return _describe(layout, best)  # almost the same records have no output to exclude
+    whole = near is not None and near.succeeded and _outputs(near.records) == _outputs(records)
+    if applied and whole:  # the fit nearby had no output to exclude
+        return _describe(layout, best)
     found = diagnose(layout, best, applied=applied)
     fit = _describe(layout, found.best)
     if found.fault is not None:
@@ -407,8 +408,8 @@ def _fit(
     return replace(fit, notes=(*fit.notes, *found.notes))
 
 
-def _count(records: Sequence[Record]) -> int:
-    """Number of outputs."""
+def _outputs(records: Sequence[Record]) -> int:
+    """Number of outputs in all records."""
     return sum(record.y.size for record in records)
 
 
@@ -454,7 +455,7 @@ def _check_size(layout: Layout, records: Sequence[Record]) -> None:
             f"There are {len(records)} records; at most {_MOST_RECORDS} are possible. "
             "Fit groups of records and compare the results, or leave some out."
         )
-    count = _count(records)
+    count = _outputs(records)
     own = layout.structure.offset + sum(s.order for s in layout.sections)
     wanted = layout.free.size + len(layout.factor_names) + own * len(records)
     if count < 2 * wanted:

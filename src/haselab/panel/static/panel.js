@@ -4,6 +4,7 @@ import { Link } from "/static/link.js";
 import { Arming, Playing, Progress, kilo } from "/static/bench.js";
 
 const STALE_MS = 450;
+const MOST_PAUSE_MS = 1000; // between two draws
 let frame = null;
 let charts = null;
 let redraw = () => {};
@@ -14,7 +15,7 @@ const link = new Link((found) => {
   if (!drawing) drawNewest();
 }, () => redraw());
 
-// Half of the time at most, so that a slow computer is free for STOP.
+// Draws for half of the time at most, so that a slow computer is free for STOP.
 async function drawNewest() {
   drawing = true;
   try {
@@ -24,7 +25,8 @@ async function drawNewest() {
       const begun_ms = performance.now();
       await draw();
       const took_ms = performance.now() - begun_ms;
-      await new Promise((resolve) => setTimeout(resolve, took_ms));
+      // A draw during which the computer slept must not be followed by an equally long pause.
+      await new Promise((resolve) => setTimeout(resolve, Math.min(took_ms, MOST_PAUSE_MS)));
     }
   } finally {
     drawing = false;

@@ -120,7 +120,7 @@ def at_a_rail(cut: Floats, used: NDArray[np.bool_]) -> NDArray[np.bool_]:
     every = np.repeat(used, cut.shape[3], axis=1)[:, np.newaxis]
     piled = np.zeros(len(cut), dtype=np.bool_)
     for sign, ends in ((1.0, flat.max(axis=2)), (-1.0, flat.min(axis=2))):
-        # most blocks have fewer such readings, in runs or not
+        # Most blocks have too few such readings, in runs or not, and need no closer look.
         equal = np.count_nonzero(flat == ends[:, :, np.newaxis], axis=2)
         some = np.flatnonzero((equal >= _FEWEST).any(axis=1))
         piled[some] |= _piled_at_top(sign * flat[some], every[some])
@@ -128,7 +128,7 @@ def at_a_rail(cut: Floats, used: NDArray[np.bool_]) -> NDArray[np.bool_]:
 
 
 def _piled_at_top(values: Floats, every: NDArray[np.bool_]) -> NDArray[np.bool_]:
-    """Whether more readings equal the largest one of a block, in runs, than lie just below."""
+    """Whether many readings equal the largest one of a block in runs, and few lie just below it."""
     below = values.max(axis=2, keepdims=True) - values
     top = below == 0.0
     inside = np.where(top, np.inf, below)

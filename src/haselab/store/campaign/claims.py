@@ -2,8 +2,8 @@
 
 A claim only saves work: if two programs compute the same case, their rows are equal. It is a file
 with the name of the program that made it. It expires when that program has ended: on the same
-computer or with locks on the shared file system at once, otherwise after `EXPIRES_S` without a sign
-of life.
+computer, or with locks that other computers see, at once; otherwise, or on a file system without
+locks, after `EXPIRES_S` without a sign of life.
 """
 
 from __future__ import annotations
@@ -153,10 +153,10 @@ class Claims:
 
 
 def _is_recent(path: Path) -> bool:
-    """Whether the last sign of life is not too old.
+    """Whether the last sign of life is less than `EXPIRES_S` away from now.
 
-    One from the future is of a clock that was set back, or of another computer. If it counted, the
-    claim of a program that has ended would last until the clock comes to it.
+    A sign from the future is of a clock that was set back, or of another computer. It does not
+    count, else the claim of a program that has ended would last until the clock reaches it.
 
     Raises:
         OSError: there is no such file.

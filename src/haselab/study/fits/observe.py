@@ -46,7 +46,7 @@ class Observation:
             drive, shape `(n,)`.
         lockin: values of the lock-in for each block.
         printed: values of the paper's sensing chain; None if they are not needed.
-        sensed: what the lock-in found; None if it did not sense recorded blocks.
+        sensed: all results of the lock-in; None if no blocks were recorded.
     """
 
     name: str

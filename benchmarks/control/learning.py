@@ -57,8 +57,9 @@ def rows(seeds: int = 1) -> Iterator[Row]:
              for row in board_rows(play_board(plan, SilentProgress()))}  # fmt: skip
     for loop, (task, metric) in itertools.product(CLASSES, COMPARED):
         paper, network = (found[name, loop, task, metric].median for name in ("pi", "network"))
-        # The PI does not reach 90 % of each step; its rise time is then infinite, and the ratio 0.
-        ratio = math.nan if network is None else network / (math.inf if paper is None else paper)
+        if paper is None and metric == "rise_s":  # the PI does not reach 90 % of each step
+            paper = math.inf
+        ratio = math.nan if network is None or paper is None else network / paper
         yield Row(f"{task} {metric}, {loop}, network over the paper's PI", ratio, "", 1.0,
                   more_is_better=False)  # fmt: skip
     for loop in CLASSES:

@@ -50,11 +50,11 @@ HANGS = Hangs()
 CAMPAIGN = """
 name = "hangs"
 kind = "hangs"
-time_limit_s = 0.5
+time_limit_s = 5.0
 [parameters]
 case.number = [0, 1, 2, 3, 4]
 """
-ERROR = "The case was stopped because it took longer than time_limit_s = 0.5."
+ERROR = "The case was stopped because it took longer than time_limit_s = 5."
 
 
 @pytest.fixture
@@ -89,13 +89,13 @@ def test_a_case_that_hangs_fails_and_its_process_is_replaced(plan: Plan, tmp_pat
 def test_the_process_of_a_dask_worker_ends_only_the_case_that_hangs(plan: Plan) -> None:
     jobs = [plan.job(index, f"{index}") for index in range(5)]
     try:
-        rows = dask._compute_limited(plan.problem, jobs, 0.5)
+        rows = dask._compute_limited(plan.problem, jobs, 5.0)
         assert [(row.index, row.error[: len(ERROR)]) for row in rows] == [(2, ERROR)]
         others = [job for job in jobs if job.index != 2]  # the program submits them again
-        again = dask._compute_limited(plan.problem, others, 0.5)
+        again = dask._compute_limited(plan.problem, others, 5.0)
         assert [(row.index, row.error) for row in again] == [(0, ""), (1, ""), (3, ""), (4, "")]
     finally:
-        dask._end_limited()
+        dask._end_limited(plan.problem)
     assert not dask._limited
 
 

@@ -113,3 +113,9 @@ def test_picofarads_in_a_column_of_farads_are_refused():
     plausible_capacitance("capacitance_f", 1e-9 * (1.0 + STRAIN))
     with pytest.raises(InputError, match=r"reaches 1120 F; .* add --unit capacitance_f=pF"):
         plausible_capacitance("capacitance_f", 1e3 * (1.0 + STRAIN))
+
+
+def test_a_subspace_model_that_grows_without_limit_has_no_result():
+    growing = Record.sampled(U, np.exp(0.18 * np.arange(U.size)), 100.0)
+    status = fit_subspace(growing, bootstrap=0).status
+    assert status.startswith("no result: with") and "grows too far" in status

@@ -211,10 +211,10 @@ def _distribution(group: Group, name: str, *, independent: bool) -> JsonObject:
 
 
 def _quantile(ordered: Floats, share: float) -> float:
-    """Quantile of ordered values, of which the last may be infinite."""
+    """Quantile of ordered values, of which the first and the last may be infinite."""
     place = share * (ordered.size - 1)
     low, high = float(ordered[math.floor(place)]), float(ordered[math.ceil(place)])
-    return low if low == high else low + (place % 1.0) * (high - low)
+    return low if low in (high, -math.inf) else low + (place % 1.0) * (high - low)
 
 
 def median_interval(values: Floats) -> Json:

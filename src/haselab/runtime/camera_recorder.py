@@ -226,7 +226,7 @@ class CameraRecorder:
         self._points = points
         self._placed = True
         if self._particles is not None:
-            still = first[: _count_at_rest(first, points)] if rest is None else rest
+            still = self._before_motion(first, points) if rest is None else rest
             self._particles.refer(still, points)
             write_png(self._folder / f"{self._name}.png", images[0])
 
@@ -236,6 +236,11 @@ class CameraRecorder:
             points = self._call(_fiducials_of, images[:1])
         except ResultError:  # too noisy; the mean of all frames may be good enough
             return images
+        return self._before_motion(images, points)
+
+    def _before_motion(
+        self, images: NDArray[np.uint8], points: NDArray[np.float64]
+    ) -> NDArray[np.uint8]:
         count = _count_at_rest(images, points)
         if count < len(images):
             self._session.event(

@@ -71,13 +71,15 @@ _changing = threading.Lock()
 def _compute_limited(problem: Problem, jobs: Sequence[Job], limit_s: float) -> list[CaseRow]:
     """Compute cases in another process; cases without a row have to be computed again."""
     executor = _limited_executor(problem, limit_s)
-    executor.submit(Chunk(0, tuple(jobs)))
-    while not (outcomes := executor.wait(1.0)):
-        pass
-    rows = outcomes[0].rows
-    if rows is None:
-        raise RuntimeError("the process ended while it computed these cases")
-    return rows
+    while True:
+        executor.submit(Chunk(0, tuple(jobs)))
+        while not (outcomes := executor.wait(1.0)):
+            pass
+        outcome = outcomes[0]
+        if outcome.rows is not None:
+            return outcome.rows
+        if outcome.blamed:  # else the process had not yet started; too many of these raise
+            raise RuntimeError("the process ended while it computed these cases")
 
 
 def _limited_executor(problem: Problem, limit_s: float) -> ProcessExecutor:
@@ -97,11 +99,11 @@ def _limited_executor(problem: Problem, limit_s: float) -> ProcessExecutor:
         return executor
 
 
-def _end_limited() -> None:
-    """End the processes of all threads of a worker."""
+def _end_limited(problem: Problem) -> None:
+    """End the processes of all threads of a worker that compute these cases."""
     with _changing:
-        while _limited:
-            _limited.popitem()[1][2].close()
+        for own in [own for own, (of, *_) in _limited.items() if of == problem]:
+            _limited.pop(own)[2].close()
 
 
 # ---- in the program ----------------------------------------------------------------------------
@@ -233,7 +235,7 @@ class DaskExecutor:
             if self._client.status == "running":
                 self._client.cancel(list(self._futures))
                 if self._limit_s is not None:
-                    self._client.run(_end_limited, on_error="ignore")
+                    self._client.run(_end_limited, self._problem, on_error="ignore")
             self._client.close(timeout=_GRACE_S)
         except Exception:  # the scheduler is gone; what counts is in the folder
             pass

@@ -105,6 +105,8 @@ def command(
     if physical_model and not found.failed:
         model = identify_physical_model(path, study, found, unverified=unverified)
         found = model.joined(found)
+    elif physical_model:
+        click.echo("haselab: no physical model, because an experiment failed.", err=True)
     if study.is_reference:
         by_model = NOT_HERE if folder is None else analysed(folder)
         found = with_model_rows(with_chip_rows(found, folder), by_model)

@@ -301,6 +301,7 @@ def fit_arx(
     record = single_driven_record(records)
     point = (float(record.u.mean()), float(record.y.mean())) if remove_means else (0.0, 0.0)
     inputs, outputs = record.u - point[0], record.y - point[1]
+    trials = 1 if orders is not None else _SEARCH_DELAY
     if orders is None:
         least_delay = 1 if record.hold == "zero" else 0
         orders = _chosen(inputs, outputs, criterion, constant=remove_means, least_delay=least_delay)
@@ -311,7 +312,7 @@ def fit_arx(
             f"{orders.na}, nb = {orders.nb}, nk = {orders.nk}. Record longer, or lower the orders."
         )
     constant = remove_means and _has_constant(inputs, outputs, orders)
-    return _fit(record, inputs, outputs, orders, point, constant)
+    return _fit(record, inputs, outputs, orders, point, constant, trials)
 
 
 @dataclass(frozen=True)
@@ -405,6 +406,7 @@ def _fit(
     orders: ArxOrders,
     point: tuple[float, float],
     constant: bool,
+    trials: int,
 ) -> ArxFit:
     rate_hz = record.input_rate_hz
     solved = _solved(u, y, orders, constant=constant)
@@ -422,7 +424,7 @@ def _fit(
         )
     elif whiteness < _WHITE:
         status, covariance = _with_bias(solved, u, y, orders, rate_hz, whiteness)
-    if status == "ok" and not _responds(solved, orders, white=whiteness >= _WHITE):
+    if status == "ok" and not _responds(solved, orders, trials, white=whiteness >= _WHITE):
         status = (
             "no result: the output shows no response to the input; check the columns and the "
             "sensor, or record longer"
@@ -457,13 +459,13 @@ def _fit(
     return replace(fit, notes=_notes(fit, model))
 
 
-def _responds(solved: _Solved, orders: ArxOrders, *, white: bool) -> bool:
-    """Whether the output depends on the input, if its delay was chosen for the largest effect."""
+def _responds(solved: _Solved, orders: ArxOrders, trials: int, *, white: bool) -> bool:
+    """Whether the output depends on the input, with the best of some delays."""
     if not np.abs(solved.errors).max() > 0.0:
         return True
     covariance = solved.covariance if white else _coloured(solved)
     part = covariance[orders.na :, orders.na :]
-    return responds(solved.coefficients[orders.na :], part, trials=_SEARCH_DELAY)
+    return responds(solved.coefficients[orders.na :], part, trials)
 
 
 def _coloured(solved: _Solved) -> Floats:

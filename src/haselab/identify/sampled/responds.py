@@ -33,4 +33,5 @@ def responds(coefficients: Floats, covariance: Floats, trials: int = 1) -> bool:
     if not np.isfinite(covariance).all():
         return True
     size = coefficients @ np.linalg.pinv(covariance, hermitian=True) @ coefficients
-    return bool(trials * chdtrc(coefficients.size, float(size)) <= _SIGNIFICANT)
+    rank = int(np.linalg.matrix_rank(covariance, hermitian=True))
+    return bool(trials * chdtrc(rank, float(size)) <= _SIGNIFICANT)

@@ -177,7 +177,9 @@ def fit_subspace(
         status = f"no result: {clipped}"
     elif values[count - 1] <= _LEAST_GAP * values[0]:
         status = f"no result: the data do not support {count} states; lower the order"
-    elif not _responds(model, inputs, residuals):
+    elif (columns := _regressors(model, inputs)) is None:
+        status = f"no result: with {count} states, the model grows too far; lower the order"
+    elif not _responds(model, columns, residuals):
         status = (
             f"no result: with {count} states, the output shows no response to the input; check the "
             "columns and the sensor, change the order, or record longer"
@@ -195,19 +197,19 @@ def fit_subspace(
         for again in _repeated(simulated, residuals, bootstrap, rng)
     ]
     whiteness = whiteness_p([residuals])
-    columns = _Columns.of(model, repeats)
+    found = _Columns.of(model, repeats)
     return SubspaceFit(
         status="ok",
-        parameters=columns.estimates,
-        covariance=columns.covariance,
+        parameters=found.estimates,
+        covariance=found.covariance,
         residuals=(residuals,),
         notes=_notes(model, whiteness, record.y.size),
         record=record,
         operating_point=point,
         model=model,
         singular_values=values,
-        static_gain=columns.estimates["static_gain"],
-        modes=_modes(model, columns.estimates),
+        static_gain=found.estimates["static_gain"],
+        modes=_modes(model, found.estimates),
         fit_percent=fit_percent([outputs], [simulated]),
         residual_whiteness_p=whiteness,
     )
@@ -271,10 +273,9 @@ def _regressors(model: StateSpaceModel, u: Floats) -> Floats | None:
     return columns if np.abs(columns).max() < _LARGEST else None
 
 
-def _responds(model: StateSpaceModel, u: Floats, residuals: Floats) -> bool:
+def _responds(model: StateSpaceModel, columns: Floats, residuals: Floats) -> bool:
     """Whether b and d, for these poles, are larger than noise explains."""
-    columns = _regressors(model, u)
-    if columns is None or not np.abs(residuals).max() > 0.0:
+    if not np.abs(residuals).max() > 0.0:
         return True
     size = model.b.size + 1
     covariance = coloured_covariance([columns], [residuals], columns.shape[1])

@@ -17,6 +17,7 @@ from haselab.campaign.folder import TABLE, finished_rows, open_folder, write_tab
 from haselab.campaign.plan import Plan, Problem
 from haselab.campaign.run import Progressed, run_cases
 from haselab.campaign.work import compute_cases
+from haselab.store.campaign.shards import CaseRow
 
 QUICK = """
 name = "quick devices"
@@ -96,6 +97,13 @@ class Campaigns:
 
     def plan(self, text: str = QUICK) -> Plan:
         return Plan(load_campaign(self.file(text)))
+
+    def rows_of(self, plan: Plan, function: Callable[..., float]) -> list[CaseRow]:
+        """Rows whose result `y` is a function of the parameters."""
+        return [
+            CaseRow(f"{k}", k, plan.values(k), {"y": float(function(*plan.values(k).values()))})
+            for k in range(plan.count)
+        ]
 
     def run(
         self, name: str, text: str = QUICK, *, retry: bool = False, **settings: Any

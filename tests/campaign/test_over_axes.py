@@ -34,13 +34,6 @@ samples = {}
 """
 
 
-def rows_of(plan: Any, function: Any) -> list[CaseRow]:
-    return [
-        CaseRow(f"{k}", k, plan.values(k), {"y": float(function(*plan.values(k).values()))})
-        for k in range(plan.count)
-    ]
-
-
 def ishigami(first: float, second: float, third: float) -> float:
     a, b, c = (2.0 * math.pi * (x - 0.5) for x in (first, second, third))
     return math.sin(a) + 7.0 * math.sin(b) ** 2 + 0.1 * c**4 * math.sin(a)
@@ -77,7 +70,7 @@ def test_sobol_indices_are_the_published_ones(
 ) -> None:
     """Twice the half width of 95 % is 3.9 standard deviations; six numbers are compared."""
     plan = campaigns.plan(UNIFORM.format(1024))
-    found = summarised(plan, rows_of(plan, function))["sensitivities"]
+    found = summarised(plan, campaigns.rows_of(plan, function))["sensitivities"]
     assert len(found) == 3
     for one, *true in zip(found, first, total, strict=True):
         for index, share in zip(("first", "total"), true, strict=True):
@@ -91,7 +84,7 @@ def test_sobol_indices_of_few_blocks_have_no_interval(
     campaigns: Any, samples: int, *, given: bool
 ) -> None:
     plan = campaigns.plan(UNIFORM.format(samples))
-    summary = summarised(plan, rows_of(plan, lambda a, b, c: a + b * c))
+    summary = summarised(plan, campaigns.rows_of(plan, lambda a, b, c: a + b * c))
     found = [one[index]["ci95"] for one in summary["sensitivities"] for index in ("first", "total")]
     assert len(found) == 6 and all((each is not None) == given for each in found)
     assert "Sensitivity: Sobol indices" in campaign_page(summary, {})
@@ -99,7 +92,7 @@ def test_sobol_indices_of_few_blocks_have_no_interval(
 
 def test_a_grid_has_its_results_over_each_axis_and_both(campaigns: Any) -> None:
     plan = campaigns.plan(GRID)
-    rows = rows_of(plan, lambda gain, delay: gain + 100.0 * delay)
+    rows = campaigns.rows_of(plan, lambda gain, delay: gain + 100.0 * delay)
     rows[1].results["y"] = math.nan  # of gain 2 and delay 0.01
     rows[4].results["y"] = math.inf  # of gain 3 and delay 0
     summary = summarised(plan, rows)
@@ -135,12 +128,12 @@ def test_an_axis_of_texts_has_a_table_and_no_figure(campaigns: Any, levels: Any)
 
 def test_distributions_at_each_point_need_no_further_tables(campaigns: Any) -> None:
     plan = campaigns.plan(GRID + "[design]\nrepeats = 8")
-    assert summarised(plan, rows_of(plan, lambda gain, delay: gain))["over_axes"] == []
+    assert summarised(plan, campaigns.rows_of(plan, lambda gain, delay: gain))["over_axes"] == []
 
 
 def test_infinities_of_both_signs_have_no_mean_and_no_warning(campaigns: Any) -> None:
     plan = campaigns.plan(GRID)
-    rows = rows_of(plan, lambda gain, delay: math.inf if gain > 1.5 else -math.inf)
+    rows = campaigns.rows_of(plan, lambda gain, delay: math.inf if gain > 1.5 else -math.inf)
     (found,) = summarised(plan, rows)["distributions"]
     assert math.isnan(found["mean"]) and found["least"] == -math.inf
 
@@ -148,7 +141,9 @@ def test_infinities_of_both_signs_have_no_mean_and_no_warning(campaigns: Any) ->
 def test_a_median_between_a_number_and_an_infinity_is_the_infinity(campaigns: Any) -> None:
     plan = campaigns.plan(GRID)
     for infinity in (-math.inf, math.inf):
-        rows = rows_of(plan, lambda gain, delay, end=infinity: gain if delay == 0.0 else end)
+        rows = campaigns.rows_of(
+            plan, lambda gain, delay, end=infinity: gain if delay == 0.0 else end
+        )
         found = {tuple(one["axes"]): one["points"] for one in summarised(plan, rows)["over_axes"]}
         assert [point["median"] for point in found["case.gain",]] == [infinity] * 3
 

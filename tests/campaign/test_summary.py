@@ -36,13 +36,6 @@ samples = {}
 """
 
 
-def rows_of(plan: Any, function: Any) -> list[CaseRow]:
-    return [
-        CaseRow(f"{k}", k, plan.values(k), {"y": float(function(*plan.values(k).values()))})
-        for k in range(plan.count)
-    ]
-
-
 @pytest.mark.long
 def test_the_interval_of_a_median_contains_it_in_at_least_95_percent() -> None:
     """Order statistics are discrete, so that for 20 values the exact share is 95.86 %."""
@@ -61,7 +54,7 @@ def test_too_few_values_have_no_interval() -> None:
 def test_sobol_indices_are_those_of_a_known_function(campaigns: Any) -> None:
     r"""Of $y = 3 a + b$ with uniform $a$, $b$ the variances are 9 and 1 parts of ten."""
     plan = campaigns.plan(DESIGN.format("saltelli", 256))
-    rows = rows_of(plan, lambda gain, omega: 3.0 * gain + omega)
+    rows = campaigns.rows_of(plan, lambda gain, omega: 3.0 * gain + omega)
     found = {one["parameter"]: one for one in summarised(plan, rows)["sensitivities"]}
     for path, share in (("case.gain", 0.9), ("case.natural_frequency_rad_s", 0.1)):
         for index in ("first", "total"):
@@ -72,7 +65,7 @@ def test_sobol_indices_are_those_of_a_known_function(campaigns: Any) -> None:
 
 def test_a_failed_case_takes_its_block_out_of_the_indices(campaigns: Any) -> None:
     plan = campaigns.plan(DESIGN.format("saltelli", 16))
-    rows = rows_of(plan, lambda gain, omega: 3.0 * gain + omega)
+    rows = campaigns.rows_of(plan, lambda gain, omega: 3.0 * gain + omega)
     rows[5] = replace(rows[5], results={}, error="it failed")
     summary = summarised(plan, rows)
     assert {one["blocks"] for one in summary["sensitivities"]} == {15}
@@ -84,7 +77,7 @@ def test_a_failed_case_takes_its_block_out_of_the_indices(campaigns: Any) -> Non
 
 def test_rank_correlations_are_those_of_monotone_and_unrelated_parameters(campaigns: Any) -> None:
     plan = campaigns.plan(DESIGN.format("random", 200))
-    rows = rows_of(plan, lambda gain, omega: math.exp(-gain))
+    rows = campaigns.rows_of(plan, lambda gain, omega: math.exp(-gain))
     found = {
         one["parameter"]: one["correlation"] for one in summarised(plan, rows)["sensitivities"]
     }
@@ -97,7 +90,7 @@ def test_a_choice_of_numbers_has_a_rank_and_one_of_texts_is_named(campaigns: Any
     drawn = "case.gain = {{ uniform = [0.0, 1.0] }}"
     text = DESIGN.replace(drawn, "case.gain = {{ choice = [0.2, 0.5, 0.3] }}")
     plan = campaigns.plan(text.format("random", 60))
-    rows = rows_of(plan, lambda gain, omega: gain)
+    rows = campaigns.rows_of(plan, lambda gain, omega: gain)
     summary = summarised(plan, rows)
     found = {one["parameter"]: one["correlation"] for one in summary["sensitivities"]}
     assert found["case.gain"]["value"] == pytest.approx(1.0) and summary["unranked"] == []
@@ -114,7 +107,7 @@ def test_a_choice_of_numbers_has_a_rank_and_one_of_texts_is_named(campaigns: Any
 def test_medians_of_the_same_cases_leave_out_those_without_a_value_in_both(campaigns: Any) -> None:
     """The larger devices fail here, so the median of the others alone would be smaller here."""
     plan = campaigns.plan(DESIGN.format("random", 60))
-    rows = rows_of(plan, lambda gain, omega: gain + 0.1)
+    rows = campaigns.rows_of(plan, lambda gain, omega: gain + 0.1)
     there = np.array([row.results["y"] - 0.1 for row in rows])
     rows = [row if there[k] < 0.6 else replace(row, results={}, error="it failed")
             for k, row in enumerate(rows)]  # fmt: skip
@@ -159,7 +152,7 @@ def test_an_interval_without_ends_does_not_count_as_one_that_contains_the_truth(
 def test_what_was_not_reached_ranks_above_all_in_a_correlation(campaigns: Any) -> None:
     """The result falls with the gain until it is not reached: the numbers alone say -1."""
     plan = campaigns.plan(DESIGN.format("random", 64))
-    rows = rows_of(plan, lambda gain, omega: -gain if gain < 0.3 else math.inf)
+    rows = campaigns.rows_of(plan, lambda gain, omega: -gain if gain < 0.3 else math.inf)
     found = {one["parameter"]: one for one in summarised(plan, rows)["sensitivities"]}
     assert found["case.gain"]["correlation"]["value"] > 0.5
     assert (found["case.gain"]["count"], found["case.gain"]["without_value"]) == (64, 0)
@@ -167,7 +160,7 @@ def test_what_was_not_reached_ranks_above_all_in_a_correlation(campaigns: Any) -
 
 def test_what_was_not_reached_is_larger_than_any_number(campaigns: Any) -> None:
     plan = campaigns.plan(DESIGN.format("random", 21))
-    rows = rows_of(plan, lambda gain, omega: gain)
+    rows = campaigns.rows_of(plan, lambda gain, omega: gain)
     rows = [replace(row, results={"y": math.inf}) if row.index < 12 else row for row in rows]
     summary = summarised(plan, rows)
     assert summary["distributions"][0]["median"]["value"] == math.inf
@@ -201,7 +194,7 @@ def test_two_campaigns_are_compared_by_their_medians(campaigns: Any) -> None:
 
 def test_the_page_is_self_contained_and_the_same_for_the_same_rows(campaigns: Any) -> None:
     plan = campaigns.plan(DESIGN.format("random", 50))
-    rows = rows_of(plan, lambda gain, omega: gain + omega)
+    rows = campaigns.rows_of(plan, lambda gain, omega: gain + omega)
     rows[3] = replace(rows[3], results={}, error="<b>it failed</b>")
     summary = summarised(plan, rows) | {"comparison": compared(rows, {"y": np.ones(50)}),
                                        "compared_with": "other"}  # fmt: skip

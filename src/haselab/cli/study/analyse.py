@@ -13,7 +13,7 @@ from haselab.cli.common import answer_options, unverified_option, warn_unverifie
 from haselab.cli.options import shared_option
 from haselab.cli.output import OutputRule
 from haselab.cli.study.chip_run import analyse_on_chip
-from haselab.cli.study.physical_model import identify_physical_model
+from haselab.cli.study.physical_model import identify_physical_model, note_no_model
 from haselab.cli.study.recommended_mass import with_mass_limit
 from haselab.cli.study.study_run import mark_found, print_results, require_complete, with_date
 from haselab.store.claim import refuse_linked_folders
@@ -106,7 +106,7 @@ def command(
         model = identify_physical_model(path, study, found, unverified=unverified)
         found = model.joined(found)
     elif physical_model:
-        click.echo("haselab: no physical model, because an experiment failed.", err=True)
+        note_no_model()
     if study.is_reference:
         by_model = NOT_HERE if folder is None else analysed(folder)
         found = with_model_rows(with_chip_rows(found, folder), by_model)

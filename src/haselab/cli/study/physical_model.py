@@ -26,7 +26,7 @@ from haselab.study.known import known_values
 from haselab.study.pipeline import Findings
 from haselab.study.run import described
 
-__all__ = ["PhysicalModel", "identify_physical_model"]
+__all__ = ["PhysicalModel", "identify_physical_model", "note_no_model"]
 
 _DIFFERENCE = "S19.chirp_difference"
 
@@ -81,6 +81,11 @@ class PhysicalModel:
             folder / ACTUATOR, "model.physical", section,
             [session_file(session)], status=self.fit.status,
         )  # fmt: skip
+
+
+def note_no_model() -> None:
+    """Say that there is no physical model of a session in which an experiment failed."""
+    click.echo("haselab: no physical model, because an experiment failed.", err=True)
 
 
 def identify_physical_model(

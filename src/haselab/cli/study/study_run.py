@@ -25,7 +25,7 @@ from haselab.cli.interrupt import Interruptible
 from haselab.cli.options import shared_option
 from haselab.cli.study.model_control import play_model_control
 from haselab.cli.study.noise_free_run import NoiseFreeRun
-from haselab.cli.study.physical_model import identify_physical_model
+from haselab.cli.study.physical_model import identify_physical_model, note_no_model
 from haselab.cli.study.recommended_mass import with_mass_limit
 from haselab.controllers import KnownActuator
 from haselab.models.actuator import ActuatorTables
@@ -199,7 +199,7 @@ def _execute(
                     rows = "S25 (observer), S27 and S30"
                     click.echo(f"haselab: {rows} were left out: {by_model}", err=True)
         elif modelled is not None:
-            click.echo("haselab: no physical model, because an experiment failed.", err=True)
+            note_no_model()
         if noise_free_run is not None:
             progress.advance(0.0, "noise-free reference run")
             noise_free = _noise_free(noise_free_run)

@@ -6,6 +6,7 @@ import itertools
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
+from functools import cached_property
 from typing import Any
 
 import numpy as np
@@ -333,6 +334,12 @@ class _Solved:
     columns: Floats
     constant: tuple[float, float] = (0.0, math.inf)
 
+    @cached_property
+    def coloured_covariance(self) -> Floats:
+        """Covariance of the coefficients for coloured prediction errors."""
+        wide = coloured_covariance([self.columns], [self.errors], self.columns.shape[1])
+        return wide[: self.coefficients.size, : self.coefficients.size]
+
 
 def _solved(u: Floats, y: Floats, orders: ArxOrders, *, constant: bool) -> _Solved:
     """Solve the equations, with a constant if asked to."""
@@ -463,15 +470,9 @@ def _responds(solved: _Solved, orders: ArxOrders, trials: int, *, white: bool) -
     """Whether the output depends on the input, with the best of some delays."""
     if not np.abs(solved.errors).max() > 0.0:
         return True
-    covariance = solved.covariance if white else _coloured(solved)
+    covariance = solved.covariance if white else solved.coloured_covariance
     part = covariance[orders.na :, orders.na :]
     return responds(solved.coefficients[orders.na :], part, trials)
-
-
-def _coloured(solved: _Solved) -> Floats:
-    """Covariance of the coefficients for coloured prediction errors."""
-    wide = coloured_covariance([solved.columns], [solved.errors], solved.columns.shape[1])
-    return wide[: solved.coefficients.size, : solved.coefficients.size]
 
 
 def _with_bias(
@@ -479,7 +480,7 @@ def _with_bias(
 ) -> tuple[str, Floats]:
     """Status, and a covariance that includes the bias, where the prediction errors are coloured."""
     size, constant = solved.coefficients.size, solved.columns.shape[1] > solved.coefficients.size
-    covariance = _coloured(solved)
+    covariance = solved.coloured_covariance
     unbiased = instrumental_coefficients(u, y, orders.numbers, orders.memory, constant=constant)
     if unbiased is None or not np.isfinite(covariance).all():
         return "ok", solved.covariance if unbiased is None else covariance

@@ -185,6 +185,23 @@ def test_a_played_study_gives_the_chosen_results_with_their_intervals(campaigns:
         assert row.results[f"{name}.low"] < row.results[name] < row.results[f"{name}.high"]
 
 
+@pytest.mark.long
+def test_the_truth_of_a_played_study_is_its_result_without_noise(campaigns: Any) -> None:
+    """The same at any noise, near each estimate, and another one at another amplitude."""
+    (campaigns.folder / "one.toml").write_text(STUDY)
+    text = PLAY.replace("[case]", "[case]\nnoise_free = true")
+    noisy = "study.triangle.high_v = [1.8, 1.9]\ntwin.acquisition.i_noise_v = [0.3e-3, 1e-3]"
+    rows = computed(campaigns.plan(text.replace("study.triangle.high_v = [1.8]", noisy)))
+    name = "S15.slope"
+    true = [row.results[f"{name}.true"] for row in rows]
+    assert true[0] == pytest.approx(true[1], rel=1e-6)
+    assert true[2] == pytest.approx(true[3], rel=1e-6)
+    assert true[0] != true[2]
+    for row in rows:
+        off = row.results[name] - row.results[f"{name}.true"]
+        assert 0.0 < abs(off) < 5.0 * row.results[f"{name}.std"]
+
+
 def test_a_study_that_the_bench_cannot_play_is_refused_before_it_begins(campaigns: Any) -> None:
     (campaigns.folder / "one.toml").write_text(STUDY)
     with pytest.raises(InputError, match=r"study\.triangle\.high_v = 2\.5"):

@@ -131,6 +131,68 @@ def test_distributions_at_each_point_need_no_further_tables(campaigns: Any) -> N
     assert summarised(plan, campaigns.rows_of(plan, lambda gain, delay: gain))["over_axes"] == []
 
 
+def test_differences_along_an_axis_are_those_of_the_same_devices(campaigns: Any) -> None:
+    """The devices differ by 10 and the second value of the axis adds 0.1; the third is worse."""
+    text = campaigns.quick.replace("samples = 8", "samples = 64").replace("sobol", "random")
+    plan = campaigns.plan(text.replace("[0.01, 0.02]", "[0.01, 0.02, 0.04]"))
+    rng = np.random.default_rng(4)
+    added = {0.01: 0.0, 0.02: 0.1, 0.04: 50.0}
+
+    def result(noise_std: float, frequency: float, gain: float) -> float:
+        return 1e3 * gain + frequency + added[noise_std] + 0.01 * rng.standard_normal()
+
+    rows = campaigns.rows_of(plan, result)
+    rows[64 + 3].results["y"] = math.inf
+    summary = summarised(plan, rows)
+    second, third = summary["along_axes"]
+    assert (second["axis"], second["value"], third["value"]) == ("case.noise_std", 0.02, 0.04)
+    assert (second["count"], second["without_value"]) == (63, 1)
+    low, high = second["median"]["ci95"]
+    assert low < 0.1 < high and high - low < 0.02
+    assert third["least"] > 49.0
+    page = campaign_page(summary, {})
+    assert "Differences along case.noise_std" in page
+    shared = campaigns.plan(text.replace("samples = 64", "samples = 64\nrepeats = 2"))
+    shared_rows = campaigns.rows_of(shared, lambda noise_std, *_: noise_std)
+    (found,) = summarised(shared, shared_rows)["along_axes"]
+    assert found["median"] == {"value": pytest.approx(0.01), "ci95": None}
+
+
+def test_differences_along_one_of_two_axes_keep_the_other(campaigns: Any) -> None:
+    plan = campaigns.plan(GRID)
+    rows = campaigns.rows_of(plan, lambda gain, delay: gain + 1e4 * delay * gain)
+    found = {
+        (one["axis"], one["value"]): (one["least"], one["median"], one["largest"])
+        for one in summarised(plan, rows)["along_axes"]
+    }
+    assert found == {
+        ("case.gain", 1.0): (-101.0, {"value": -51.0, "ci95": None}, -1.0),
+        ("case.gain", 3.0): (1.0, {"value": 51.0, "ci95": None}, 101.0),
+        ("case.delay_s", 0.01): (100.0, {"value": 200.0, "ci95": None}, 300.0),
+    }
+
+
+def test_the_page_says_what_its_figures_leave_out(campaigns: Any) -> None:
+    delays = [0.01 * k for k in range(9)]
+    plan = campaigns.plan(GRID.replace("[0.0, 0.01]", str(delays)))
+    rows = campaigns.rows_of(plan, lambda gain, delay: gain + delay)
+    page = campaign_page(summarised(plan, rows), {f"y{k}": {} for k in range(13)})
+    assert "The first 6 of 9 values of case.delay_s." in page
+    assert "The first 12 of 13 results." in page
+    assert page.index("<table>") < page.index("<svg")
+
+
+def test_errors_that_differ_in_their_numbers_are_counted_together(campaigns: Any) -> None:
+    plan = campaigns.plan(GRID)
+    rows = campaigns.rows_of(plan, lambda gain, delay: gain)
+    for k, error in enumerate(["5.3e-2 is too far.", "1,200 is too far.", "No result."]):
+        rows[k + 1] = replace(rows[k + 1], error=error, results={})
+    found = summarised(plan, rows)["failures"]
+    assert [(one["error"], one["count"], one["index"]) for one in found] == [
+        ("5.3e-2 is too far.", 2, 1), ("No result.", 1, 3),
+    ]  # fmt: skip
+
+
 def test_infinities_of_both_signs_have_no_mean_and_no_warning(campaigns: Any) -> None:
     plan = campaigns.plan(GRID)
     rows = campaigns.rows_of(plan, lambda gain, delay: math.inf if gain > 1.5 else -math.inf)

@@ -111,11 +111,14 @@ def changes_of(old: Json, new: Json, path: str = "") -> list[str]:
             change for where, name in inner
             for change in changes_of(old.get(name), new.get(name), where)
         ]  # fmt: skip
-    return [] if old == new else [f"{path} is {_short(old)} there and {_short(new)} here"]
+    if old == new:
+        return []
+    name = path.removeprefix("tables.")  # as in the campaign file
+    return [f"{name} is {_short(old)} there and {_short(new)} here"]
 
 
 def _short(value: Json) -> str:
-    text = repr(value)
+    text = "missing" if value is None else repr(value)
     return text if len(text) <= 60 else f"{text[:57]}..."
 
 

@@ -7,6 +7,7 @@ shares are exact (Clopper and Pearson); both take the cases as independent draws
 from __future__ import annotations
 
 import math
+import re
 from collections import Counter
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
@@ -39,6 +40,8 @@ _RESAMPLED = 1000
 _LEAST_BLOCKS = 64
 _SEED = 1  # of resampling: the same rows give the same intervals
 LEAST_CASES = 8
+_MOST_COMPARED = 8  # values of an axis
+_NUMBER = re.compile(r"\d[\d.,]*(e[-+]?\d+)?")
 
 
 @dataclass(frozen=True)
@@ -146,6 +149,7 @@ def summarised(plan: Plan, rows: Sequence[CaseRow]) -> JsonObject:
         "sensitivities": list(_sensitivities(campaign, groups, names, independent=independent)),
         "unranked": [*_unranked(campaign)],
         "over_axes": _over_axes(campaign, groups, names),
+        "along_axes": [*_along_axes(campaign, rows, names)],
         "failures": _failures(rows),
         "without_effect": [*_without_effect(campaign, rows)],
     }
@@ -157,6 +161,33 @@ def _over_axes(campaign: Campaign, groups: Sequence[Group], names: Sequence[str]
         return []
     values = {name: groups[0].values(name) for name in names}
     return list(over_axes(campaign, groups[0].rows, values))
+
+
+def _along_axes(
+    campaign: Campaign, rows: Sequence[CaseRow], names: Sequence[str]
+) -> Iterator[JsonObject]:
+    """Differences between the first and each other value of an axis, with all else the same.
+
+    Cases at both values have the same drawn devices, and with `same_noise` also the same noise.
+    """
+    varied = [axis for axis in campaign.axes if len(axis.values) > 1]
+    described = campaign.described()
+    independent = (
+        len(varied) == 1 and is_random(described)
+        and draws_are_independent(described, grouped=True)
+    )  # fmt: skip
+    each = campaign.points * campaign.design.repeats
+    shape = (*(len(axis.values) for axis in campaign.axes), each)
+    for place, axis in enumerate(campaign.axes):
+        if axis not in varied or len(axis.values) > _MOST_COMPARED:
+            continue
+        for name in names:
+            values = np.array([_number(row.results.get(name)) for row in rows]).reshape(shape)
+            first, *others = np.moveaxis(values, place, 0)
+            for value, other in zip(axis.values[1:], others, strict=True):
+                found = _differences(other.ravel(), first.ravel(), independent=independent)
+                if found is not None:
+                    yield {"axis": axis.path, "value": value, "result": name, **found}
 
 
 # ---- distributions -----------------------------------------------------------------------------
@@ -364,11 +395,15 @@ def _rank_correlations(
 
 
 def _failures(rows: Sequence[CaseRow]) -> list[Json]:
-    """Errors with the number of cases and the first of them, the most frequent first."""
-    counts = Counter(row.error for row in rows if row.error)
-    first = {row.error: row for row in reversed(rows) if row.error}
+    """Errors with the number of cases and the first of them, the most frequent first.
+
+    Errors that differ only in their numbers are one.
+    """
+    failed = [(_NUMBER.sub("0", row.error), row) for row in rows if row.error]
+    counts = Counter(error for error, _ in failed)
+    first = dict(reversed(failed))
     return [
-        {"error": error, "count": count, "index": first[error].index,
+        {"error": first[error].error, "count": count, "index": first[error].index,
          "values": dict(first[error].values)}
         for error, count in counts.most_common()
     ]  # fmt: skip
@@ -482,15 +517,23 @@ def paired(
     for name in result_names(here):
         if name not in there or there[name].size != len(here):
             continue
-        with np.errstate(invalid="ignore"):  # infinity less infinity
-            difference = group.values(name) - there[name]
-        differences = np.sort(difference[np.isfinite(difference)])
-        if differences.size:
-            found.append({
-                "result": name, "count": differences.size,
-                "without_value": len(here) - differences.size,
-                "least": float(differences[0]), "largest": float(differences[-1]),
-                "median": {"value": _quantile(differences, 0.5),
-                           "ci95": _order_interval(differences, 0.5) if independent else None},
-            })  # fmt: skip
+        one = _differences(group.values(name), there[name], independent=independent)
+        if one is not None:
+            found.append({"result": name, **one})
     return found
+
+
+def _differences(here: Floats, there: Floats, *, independent: bool) -> JsonObject | None:
+    """Number, median and extremes of the finite differences; None: there are none."""
+    with np.errstate(invalid="ignore"):  # infinity less infinity
+        difference = here - there
+    finite = np.sort(difference[np.isfinite(difference)])
+    if not finite.size:
+        return None
+    return {
+        "count": finite.size,
+        "without_value": difference.size - finite.size,
+        "least": float(finite[0]), "largest": float(finite[-1]),
+        "median": {"value": _quantile(finite, 0.5),
+                   "ci95": _order_interval(finite, 0.5) if independent else None},
+    }  # fmt: skip

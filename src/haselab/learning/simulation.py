@@ -4,7 +4,8 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
+from typing import cast
 
 import numpy as np
 from numpy.typing import NDArray
@@ -14,6 +15,7 @@ from haselab.actuators import GRAVITY_M_S2
 from haselab.base import InputError, is_real, shown
 from haselab.controllers.network.controller import STRAIN_PER_ONE
 from haselab.learning.tasks import find_task
+from haselab.rig.twin.config import TwinConfig
 from haselab.rig.twin.twin_bench import native_bench
 from haselab.scoreboard.devices import ZERO_LENGTH_M, Device, drawn, find_device
 from haselab.scoreboard.knowledge import TRAINED
@@ -57,17 +59,17 @@ def whole_number(name: str, value: object, low: int, high: int) -> None:
 
 @dataclass(frozen=True)
 class _Pool:
-    """Settled devices."""
+    """Settled devices. Arrays have the shape `(devices,)`."""
 
     benches: tuple[_twin.Bench, ...]
     switch_at: tuple[int, ...]
     zero_m: Floats  # length at rest, at the drive of strain 0
     zero_f: Floats  # capacitance there
     relative_noise: Floats
-    load_n: float
-    low_v: float
-    high_v: float
-    zero_v: float
+    load_n: Floats
+    zero_v: Floats
+    middle_v: Floats  # of the range of the drive
+    scale_v: Floats  # half of the range
 
 
 class StrainSimulation:
@@ -76,7 +78,8 @@ class StrainSimulation:
     Args:
         task: name of a task.
         slots: number of loops.
-        devices: how many different devices are drawn, or the devices; each episode takes one.
+        devices: how many different devices are drawn, or the devices; each episode takes one. A
+            twin as such is driven from 0 to 2 V, and has strain 0 at 1.04 V, like the public twin.
         devices_seed: of the drawn devices.
         episode_s: duration of an episode, in s.
     Raises:
@@ -88,7 +91,7 @@ class StrainSimulation:
         task: str,
         slots: int,
         *,
-        devices: int | Sequence[Device] = _DEVICES,
+        devices: int | Sequence[Device | TwinConfig] = _DEVICES,
         devices_seed: int = 0,
         episode_s: float = _EPISODE_S,
     ) -> None:
@@ -107,6 +110,8 @@ class StrainSimulation:
         self._device = np.zeros(slots, dtype=np.int64)
         self._update = np.zeros(slots, dtype=np.int64)
         self._drive_v = np.zeros((2, slots))  # of this update, and of the one before
+        self._middle_v, self._scale_v = np.zeros(slots), np.ones(slots)
+        self._load_n = np.zeros(slots)
         self._strain = np.zeros((3, slots))
         self._capacitance_f, self.length_m = np.zeros(slots), np.zeros(slots)
         self._row = np.arange(slots)
@@ -158,18 +163,25 @@ class StrainSimulation:
         """
         pool = self._pool
         chosen = rng.integers(len(pool.benches), size=which.size)
-        self._ensemble.reset(which, chosen)
-        self._device[which], self._update[which] = chosen, 0
-        self._begun[which] = True
-        self._drive_v[:, which] = pool.zero_v
-        self.length_m[which] = pool.zero_m[chosen]
+        self._begin(which, chosen)
         low, high = self._reach
         for slot, device in zip(which.tolist(), chosen.tolist(), strict=True):
             reference, pull = self.task.draw(rng, self._time_s)
             self._reference[slot] = low[device] + (high[device] - low[device]) * reference
-            self._pull_n[slot] = pool.load_n * pull
+            self._pull_n[slot] = pool.load_n[device] * pull
         sensed = self._sense(np.asarray(pool.zero_f[chosen]), chosen, rng)
         self._strain[:, which] = sensed
+
+    def _begin(self, which: NDArray[np.int64], devices: NDArray[np.int64]) -> None:
+        """Set loops to devices at rest, at the drive of strain 0."""
+        pool = self._pool
+        self._ensemble.reset(which, devices)
+        self._device[which], self._update[which] = devices, 0
+        self._begun[which] = True
+        self._drive_v[:, which] = pool.zero_v[devices]
+        self._middle_v[which], self._scale_v[which] = pool.middle_v[devices], pool.scale_v[devices]
+        self._load_n[which] = pool.load_n[devices]
+        self.length_m[which] = pool.zero_m[devices]
 
     def reset_alike(self, groups: int, rng: np.random.Generator) -> None:
         """Begin the same episodes in each of some groups of slots, to compare policies.
@@ -181,14 +193,9 @@ class StrainSimulation:
         size = self.slots // groups
         first = np.arange(size)
         self.reset(first, rng)
-        device = np.tile(self._device[:size], groups)
-        self._ensemble.reset(np.arange(self.slots), device)
-        self._device[:], self._update[:] = device, 0
-        self._begun[:] = True
+        self._begin(np.arange(self.slots), np.tile(self._device[:size], groups))
         for values in (self._reference, self._pull_n):
             values[:] = np.tile(values[:size], (groups, 1))
-        self._drive_v[:] = self._pool.zero_v
-        self.length_m[:] = self._pool.zero_m[device]
         self._strain[:] = np.tile(self._strain[:, :size], (1, groups))
 
     def step(self, actions: Floats, rng: np.random.Generator) -> tuple[Floats, Flags, Flags]:
@@ -203,7 +210,7 @@ class StrainSimulation:
         Raises:
             InputError: An action is not finite, or an episode has not begun or is over.
         """
-        pool, drive = self._pool, self._drive_v
+        drive = self._drive_v
         if not np.isfinite(actions).all():
             wrong = actions[~np.isfinite(actions)][0]
             raise InputError(
@@ -214,16 +221,15 @@ class StrainSimulation:
             raise InputError("The episode has not begun. Call reset() before step().")
         if (self._update > self._updates).any():
             raise InputError("The episode is over. Call reset() before step().")
-        scale = 0.5 * (pool.high_v - pool.low_v)
         drive[1] = drive[0]
-        drive[0] = pool.low_v + scale * (np.clip(actions, -1.0, 1.0) + 1.0)
+        drive[0] = self._middle_v + self._scale_v * np.clip(actions, -1.0, 1.0)
         pull_n = self._pull_n[self._row, self._update]
         self._ensemble.update(
-            drive[1], drive[0], pool.load_n + pull_n,
+            drive[1], drive[0], self._load_n + pull_n,
             self._capacitance_f, self.length_m,
         )  # fmt: skip
         error = (self.strain - self.reference) / STRAIN_PER_ONE
-        change = (drive[0] - drive[1]) / scale
+        change = (drive[0] - drive[1]) / self._scale_v
         rewards = -np.abs(error) - CHANGE_COST * change**2
         terminated = np.zeros(self.slots, dtype=bool)
         if self._ensemble.any_fault:
@@ -240,12 +246,10 @@ class StrainSimulation:
         Returns:
             Shape `(slots, 6)`.
         """
-        pool = self._pool
         found = np.empty((self.slots, len(OBSERVATIONS)), dtype=np.float32)
         found[:, 0:3] = self._strain.T / STRAIN_PER_ONE
         found[:, 3] = self.reference / STRAIN_PER_ONE
-        middle, scale = 0.5 * (pool.high_v + pool.low_v), 0.5 * (pool.high_v - pool.low_v)
-        found[:, 4:6] = (self._drive_v.T - middle) / scale
+        found[:, 4:6] = ((self._drive_v - self._middle_v) / self._scale_v).T
         return np.clip(found, -LARGEST_OBSERVATION, LARGEST_OBSERVATION, out=found)
 
     def _sense(
@@ -257,44 +261,51 @@ class StrainSimulation:
         return np.interp(relative * (1.0 + noise), self._map_f, self._map_strain)
 
 
-def _pool(devices: int | Sequence[Device], seed: int) -> _Pool:
-    if not isinstance(devices, Sequence) or isinstance(devices, str):
-        whole_number("The number of devices", devices, 1, 100_000)
-        whole_number("devices_seed", seed, 0, 2**63 - 1)
-        rng = np.random.default_rng(seed)
-        devices = [drawn(rng) for _ in range(devices)]
-    if not devices:
-        raise InputError("No devices are given. State at least one.")
-    for device in devices:
-        if not isinstance(device, Device):
-            raise InputError(
-                f"The devices contain {shown(device)}. State a number of devices, or objects of "
-                "haselab.scoreboard.devices.Device."
-            )
-    first = devices[0]
-    if other := {device.config.kind for device in devices} - {find_device("hz").config.kind}:
-        raise InputError(
-            f"The devices contain a {other.pop()}. The environments simulate planar HASELs only."
-        )
-    for name in ("mass_kg", "low_v", "high_v", "zero_v"):
-        values = sorted({getattr(device, name) for device in devices})
-        if len(values) > 1:
-            raise InputError(
-                f"The devices have {name} from {values[0]:g} to {values[-1]:g}. Devices of one "
-                "environment must share mass and voltages: make an environment for each value."
-            )
-    settled = [_settled(device) for device in devices]
+def _pool(devices: int | Sequence[Device | TwinConfig], seed: int) -> _Pool:
+    listed = [_device(one) for one in _listed(devices, seed)]
+    settled = [_settled(one) for one in listed]
+    low_v, high_v = (np.array([getattr(one, end) for one in listed]) for end in ("low_v", "high_v"))
     return _Pool(
         tuple(settled),
-        tuple(_LOOP.switch_at + round(device.late_s / STEP_S) for device in devices),
+        tuple(_LOOP.switch_at + round(one.late_s / STEP_S) for one in listed),
         np.array([bench.length_m for bench in settled]),
-        np.array([bench.capacitance(bench.length_m, device.zero_v * device.config.amplifier.gain)
-                  for bench, device in zip(settled, devices, strict=True)]),
-        np.array([_noise(device, bench.length_m)
-                  for bench, device in zip(settled, devices, strict=True)]),
-        GRAVITY_M_S2 * first.mass_kg,
-        first.low_v, first.high_v, first.zero_v,
+        np.array([bench.capacitance(bench.length_m, one.zero_v * one.config.amplifier.gain)
+                  for bench, one in zip(settled, listed, strict=True)]),
+        np.array([_noise(one, bench.length_m)
+                  for bench, one in zip(settled, listed, strict=True)]),
+        np.array([GRAVITY_M_S2 * one.mass_kg for one in listed]),
+        np.array([one.zero_v for one in listed]),
+        0.5 * (high_v + low_v), 0.5 * (high_v - low_v),
     )  # fmt: skip
+
+
+def _listed(devices: object, seed: int) -> Sequence[object]:
+    """The given devices, or as many drawn ones as their number says."""
+    if isinstance(devices, Sequence) and not isinstance(devices, str):
+        if not devices:
+            raise InputError("No devices are given. State at least one.")
+        return devices
+    whole_number("The number of devices", devices, 1, 100_000)
+    whole_number("devices_seed", seed, 0, 2**63 - 1)
+    rng = np.random.default_rng(seed)
+    return [drawn(rng) for _ in range(cast("int", devices))]
+
+
+def _device(given: object) -> Device:
+    public = find_device("hz")
+    if isinstance(given, TwinConfig):
+        given = replace(public, config=given)
+    if not isinstance(given, Device):
+        raise InputError(
+            f"The devices contain {shown(given)}. State a number of devices, or objects of "
+            "haselab.scoreboard.devices.Device or haselab.rig.twin.config.TwinConfig."
+        )
+    if given.config.kind != public.config.kind:
+        raise InputError(
+            f"The devices contain a {given.config.kind}. The environments simulate planar HASELs "
+            "only."
+        )
+    return given
 
 
 def _reach(pool: _Pool) -> tuple[Floats, Floats]:
@@ -303,13 +314,13 @@ def _reach(pool: _Pool) -> tuple[Floats, Floats]:
     ends = _twin.Ensemble(
         pool.benches, pool.switch_at, count, (_LOOP.steps, _LOOP.first, _LOOP.last)
     )
-    load_n, farad, length_m = np.full(count, pool.load_n), np.empty(count), np.empty(count)
+    farad, length_m = np.empty(count), np.empty(count)
     found = []
-    for drive_v in (pool.low_v, pool.low_v + _USED * (pool.high_v - pool.low_v)):
+    for share in (-1.0, 2.0 * _USED - 1.0):
         ends.reset(np.arange(count), np.arange(count))
-        held = np.full(count, drive_v)
+        held = pool.middle_v + share * pool.scale_v
         for _ in range(_REACH_UPDATES):
-            ends.update(held, held, load_n, farad, length_m)
+            ends.update(held, held, pool.load_n, farad, length_m)
         found.append(length_m / pool.zero_m - 1.0)
     return found[0], found[1]
 

@@ -30,6 +30,9 @@ class StrainVectorEnv(VectorEnv[Observed, Observed, Any]):
         num_envs: number of loops.
         task: `track`, `hold` or `gait`.
         options: see `StrainSimulation`.
+
+    The information of a step has the arrays `strain` (true), `reference` and `drive_v` (in V) of
+    all loops, and for each a mask with an underscore before its name, which is always true.
     Raises:
         InputError: An argument is unknown or out of range.
     Example:
@@ -53,6 +56,8 @@ class StrainVectorEnv(VectorEnv[Observed, Observed, Any]):
         self.observation_space = batch_space(self.single_observation_space, num_envs)
         self.action_space = batch_space(self.single_action_space, num_envs)
         self._ended = np.zeros(num_envs, dtype=bool)
+        self._all = np.ones(num_envs, dtype=bool)
+        self._all.setflags(write=False)
 
     def reset(self, *, seed: Any = None, options: Any = None) -> tuple[Observed, JsonObject]:
         """Begin all episodes.
@@ -79,7 +84,7 @@ class StrainVectorEnv(VectorEnv[Observed, Observed, Any]):
         which = self._chosen((options or {}).get("reset_mask"))
         self._simulation.reset(which.astype(np.int64), self.np_random)
         self._ended[which] = False
-        return self._simulation.observe(), {}
+        return self._simulation.observe(), self._info()
 
     def _chosen(self, mask: object) -> NDArray[np.intp]:
         """Return the indices of the episodes that begin."""
@@ -108,4 +113,13 @@ class StrainVectorEnv(VectorEnv[Observed, Observed, Any]):
             self._simulation.reset(np.flatnonzero(began).astype(np.int64), self.np_random)
             rewards[began], terminated[began], truncated[began] = 0.0, False, False
         self._ended = terminated | truncated
-        return self._simulation.observe(), rewards, terminated, truncated, {}
+        return self._simulation.observe(), rewards, terminated, truncated, self._info()
+
+    def _info(self) -> JsonObject:
+        simulation = self._simulation
+        found = {
+            "strain": simulation.strain,
+            "reference": simulation.reference,
+            "drive_v": simulation.drive_v.copy(),  # the next step changes it
+        }
+        return {**found, **{f"_{name}": self._all for name in found}}

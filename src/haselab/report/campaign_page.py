@@ -60,6 +60,7 @@ def campaign_page(summary: Mapping[str, Any], values: Values) -> str:
         f"them failed. Design: {design['kind']}{repeats}. haselab {summary['code']}.",
         about=_about(summary),
         figures=[*_figures(values), *_figures_over(summary["over_axes"])],
+        left_out=_left_out(values, summary["over_axes"]),
         tables=[table for table in _tables(summary) if table.rows],
     )
 
@@ -99,6 +100,23 @@ def _meaning(summary: Mapping[str, Any]) -> str:
         "take the cases as independent draws; points of a Sobol or Latin hypercube design are "
         "spread more evenly, which makes the intervals too wide."
     )
+
+
+def _left_out(values: Values, over: Sequence[Mapping[str, Any]]) -> str:
+    """Say what the figures do not show."""
+    parts = []
+    if len(values) > _MOST_FIGURES:
+        parts.append(f"The first {_MOST_FIGURES} of {len(values)} results.")
+    most = max((len(groups) for groups in values.values()), default=0)
+    if most > _MOST_CURVES:
+        parts.append(f"The first {_MOST_CURVES} of {most} points of the axes.")
+    for path, levels in {
+        one["axes"][1]: len({point["at"][1] for point in one["points"]})
+        for one in over if len(one["axes"]) == 2
+    }.items():  # fmt: skip
+        if levels > _MOST_CURVES:
+            parts.append(f"The first {_MOST_CURVES} of {levels} values of {path}.")
+    return " ".join(parts)
 
 
 def _figures(values: Values) -> Iterator[str]:
@@ -147,11 +165,13 @@ def _tables(summary: Mapping[str, Any]) -> Iterator[_Table]:
         ],
     )  # fmt: skip
     yield from _over(summary["over_axes"])
+    yield from _along(summary["along_axes"])
     yield from _sensitivities(summary["sensitivities"])
     yield _Table(
         "Failed cases",
-        "Errors, the most frequent first, with the first case of each. failed.txt has all "
-        "tracebacks. Add --retry-failed to compute these cases again.",
+        "Errors, the most frequent first, with the first case of each. Errors that differ only in "
+        "their numbers are counted together. failed.txt has all tracebacks. Add --retry-failed to "
+        "compute these cases again.",
         ("Error", "Cases", "First case", "Its parameters"),
         [
             (one["error"][:_MOST_CHARACTERS], str(one["count"]), str(one["index"]),
@@ -185,9 +205,7 @@ def _tables(summary: Mapping[str, Any]) -> Iterator[_Table]:
         ("Result", "Cases", "Left out", "Smallest difference", "Median difference",
          "Largest difference"),
         [
-            (one["result"], str(one["count"]), str(one["without_value"]), _text(one["least"]),
-             _with_interval(one["median"]), _text(one["largest"]))
-            for one in summary.get("paired", ())
+            (one["result"], *_differing(one)) for one in summary.get("paired", ())
         ],
     )  # fmt: skip
 
@@ -202,6 +220,29 @@ def _over(found: Sequence[Mapping[str, Any]]) -> Iterator[_Table]:
             yield _over_one(axes[0], results[:_MOST_RESULTS], len(results))
         else:
             yield from (_over_two(axes, result) for result in results[:_MOST_RESULTS])
+
+
+def _along(found: Sequence[Mapping[str, Any]]) -> Iterator[_Table]:
+    for path in dict.fromkeys(one["axis"] for one in found):
+        yield _Table(
+            f"Differences along {path}",
+            "Result at a value minus that at the first value of the axis, in cases with the same "
+            "values of all other parameters: differences between devices cancel. Cases "
+            "without a finite value in both are left out.",
+            ("Result", path, "Cases", "Left out", "Smallest difference", "Median difference",
+             "Largest difference"),
+            [
+                (one["result"], _shown(one["value"]), *_differing(one))
+                for one in found if one["axis"] == path
+            ],
+        )  # fmt: skip
+
+
+def _differing(one: Mapping[str, Any]) -> tuple[str, ...]:
+    return (
+        str(one["count"]), str(one["without_value"]), _text(one["least"]),
+        _with_interval(one["median"]), _text(one["largest"]),
+    )  # fmt: skip
 
 
 def _over_one(path: str, results: Sequence[Mapping[str, Any]], count: int) -> _Table:
@@ -284,7 +325,8 @@ def _sensitivities(found: Sequence[Mapping[str, Any]]) -> Iterator[_Table]:
     yield _Table(
         "Sensitivity: Sobol indices",
         "First-order index: share of the variance that a parameter causes alone. Total index: "
-        "together with all others. Intervals of 95 % from resampling. A block of samples in which "
+        "together with all others; if it is the smaller of the two, this is the error of both. "
+        "Intervals of 95 % from resampling. A block of samples in which "
         "a case has no finite value is left out; if many are, the indices are those of a part of "
         "the distributions only.",
         ("Result", "Axes", "Parameter", "First-order index", "Total index", "Blocks", "Left out"),

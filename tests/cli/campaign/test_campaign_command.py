@@ -130,11 +130,36 @@ def test_if_all_cases_fail_there_is_no_result(
     assert "no equilibrium" in Path("out/report.html").read_text()
 
 
+def test_a_case_alone_has_the_results_of_the_table_and_writes_nothing(
+    file: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    import pyarrow.parquet
+
+    assert code_of("campaign", file, "--case", 1, "--json") == 0
+    found = json.loads(capsys.readouterr().out)
+    assert [path.name for path in Path().iterdir()] == [file.name]
+    assert code_of("campaign", file, "--out", "out", "--workers", 1) == 0
+    row = pyarrow.parquet.read_table("out/results.parquet").to_pylist()[1]
+    assert found["parameters"] == {"case.gain": row["case.gain"]} == {"case.gain": 0.6}
+    assert found["results"] and all(row[name] == one for name, one in found["results"].items())
+    capsys.readouterr()
+    assert code_of("campaign", file, "--case", 1) == 0
+    printed = dict(line.split(" = ") for line in capsys.readouterr().out.splitlines())
+    assert float(printed["gain"]) == pytest.approx(row["gain"], rel=1e-5)
+    file.write_text(BREAKS)
+    assert code_of("campaign", file, "--case", 0) == 3
+    said = capsys.readouterr()
+    assert said.out == "" and "Traceback" in said.err
+    assert said.err.splitlines()[-1].startswith("haselab: Case 0 failed: ")
+    assert "has no equilibrium" in said.err
+
+
 @pytest.mark.parametrize(
     ("words", "code", "said"),
     [
         ((), 2, "Missing option '--out'"),
         (("--out", "full/notes.txt"), 2, "--out names a file, not a folder"),
+        (("--case", "2"), 2, "--case is 2, but the campaign has the cases 0 to 1"),
         (("--out", "full"), 2, "not empty and holds no campaign"),
         (("--out", "new", "--compare", "full"), 2, "This folder has no results.parquet"),
         (("--out", "new", "--workers", "0"), 2, "0 is not in the range 1<=x<=256"),

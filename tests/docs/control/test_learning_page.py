@@ -13,6 +13,8 @@ def test_the_examples_of_the_page_run(
     capsys: pytest.CaptureFixture[str], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.chdir(tmp_path)
+    (devices,) = PAGE.toml
+    (tmp_path / "devices.toml").write_text(devices, encoding="utf-8")
     names: dict[str, object] = {}
     for code in PAGE.python:
         PAGE.execute(code, names)

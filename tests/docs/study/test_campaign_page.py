@@ -3,17 +3,21 @@
 from __future__ import annotations
 
 import json
+import math
 import re
 import shlex
 import sys
 from pathlib import Path
 
+import numpy as np
 import pytest
 
+from haselab.base import InputError
 from haselab.campaign.definition import load_campaign
-from haselab.campaign.kinds.case_kind import CASE_KINDS
+from haselab.campaign.kinds.case_kind import CASE_KINDS, Inputs
 from haselab.campaign.plan import Plan
 from haselab.cli.main import cli
+from tests.docs.page import Page
 
 ROOT = Path(__file__).resolve().parents[3]
 TEXT = (ROOT / "docs" / "study" / "campaign.md").read_text(encoding="utf-8")
@@ -38,6 +42,22 @@ def test_the_commands_of_the_page_run_in_their_order(
             assert summary["failed"] == 0
             for name in ("results.parquet", "report.html", "failed.txt"):
                 assert (out / name).exists()
+
+
+def test_the_kind_of_the_page_has_intervals_that_contain_the_truth() -> None:
+    """Of 400 means of 1000 samples, within four standard deviations of 95 %."""
+    *_, code = Page("study/campaign.md").python
+    kind = Page("study/campaign.md").execute(code)["MINE"]
+    inputs, rng = Inputs({"case": {"samples": 1000, "voltage_v": 3.0}}), np.random.default_rng(2)
+    kind.check(inputs)
+    inside = 0
+    for _ in range(400):
+        found = kind.compute(inputs, rng)
+        low, high = found["voltage_v"].ci95
+        inside += low <= found["voltage_v.true"] <= high
+    assert abs(inside / 400 - 0.95) < 4.0 * math.sqrt(0.95 * 0.05 / 400)
+    with pytest.raises(InputError, match="samples"):
+        kind.check(Inputs({"case": {"samples": 1}}))
 
 
 @pytest.mark.parametrize("name", [path.stem for path in FILES.glob("*.toml")

@@ -15,8 +15,9 @@ from haselab.rig.twin.twin_bench import make_twin
 from haselab.safety.armed import armed
 from haselab.store.toml import Section
 from haselab.study.definition import Study, builtin_study, checked_study, load_study
+from haselab.study.experiment import ExperimentResult
 from haselab.study.feasibility import check_drives, check_settings
-from haselab.study.run import RunOptions, run_study
+from haselab.study.run import RunOptions, noise_free_results, run_study
 from haselab.study.simulated.truth import parameters
 
 __all__ = ["PLAY", "PlaySettings"]
@@ -40,10 +41,13 @@ def _study_of(inputs: Inputs) -> Study:
 
 
 class PlaySettings(Section):
-    """Which results of the study are kept."""
+    """Which results of the study are kept, and with what they are compared."""
 
     results: tuple[str, ...] = Field(
         (), description="ids, all if there are none", examples=[["S20.omega_n"]]
+    )
+    noise_free: bool = Field(
+        False, description="play the study without noise, too; its results count as true"
     )
 
 
@@ -59,11 +63,16 @@ class _Play(CaseKind):
 
     def compute(self, inputs: Inputs, rng: np.random.Generator) -> Results:
         case, twin = inputs.settings(PlaySettings), twin_of(inputs)
-        seed = int(rng.integers(2**31))
+        seed, study = int(rng.integers(2**31)), _study_of(inputs)
+        played: dict[type, object] = {}
+
+        def fitted(outcome: ExperimentResult) -> None:
+            played.update((type(value), value) for value in outcome.values)
+
         with tempfile.TemporaryDirectory(prefix="haselab-case-") as folder:
             options = RunOptions(Path(folder), seed, "none", twin.model_dump(mode="json"))
             with armed(make_twin(twin, seed)) as bench:
-                found = run_study(_study_of(inputs), bench, options, SilentProgress())
+                found = run_study(study, bench, options, SilentProgress(), fitted)
         if not case.results:
             found.require_complete()
         wanted = case.results or tuple(found.quantities)
@@ -71,7 +80,8 @@ class _Play(CaseKind):
         if missing:
             why = "; ".join(found.missing.get(name, "no such result") for name in missing)
             raise ResultError(f"The study has no result {', '.join(missing)}: {why}.")
-        true = parameters(twin)
+        noise_free = noise_free_results(twin, study, None, played) if case.noise_free else {}
+        true = {**noise_free, **parameters(twin)}
         return {name: found.quantities[name] for name in wanted} | {
             f"{name}.true": true[name] for name in wanted if name in true
         }

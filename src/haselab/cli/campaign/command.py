@@ -11,7 +11,7 @@ import click
 import numpy as np
 from numpy.typing import NDArray
 
-from haselab.base import JsonObject, ResultError, to_plain
+from haselab.base import InputError, JsonObject, ResultError, to_plain
 from haselab.campaign.definition import load_campaign
 from haselab.campaign.executors.executor import Executor
 from haselab.campaign.executors.processes import ProcessExecutor
@@ -37,6 +37,7 @@ from haselab.campaign.summary import (
     share_cases,
     summarised,
 )
+from haselab.campaign.work import compute_case
 from haselab.cli.common import WORKERS, answer_options, progress_bar
 from haselab.cli.interrupt import Interruptible
 from haselab.cli.options import shared_option
@@ -59,6 +60,11 @@ __all__ = ["command"]
     "--retry-failed", is_flag=True, help="Compute failed cases again, and keep the others."
 )
 @click.option(
+    "--case", "index", type=click.IntRange(0), metavar="INDEX",
+    help="Compute only the case with this index, print its results or its traceback, and write "
+    "nothing. Default: all cases.",
+)  # fmt: skip
+@click.option(
     "--compare", "other", type=click.Path(path_type=Path), metavar="DIR",
     help="Compare the results with those of the campaign in this folder. Default: none.",
 )  # fmt: skip
@@ -73,6 +79,7 @@ def command(
     scheduler: str | None,
     *,
     retry_failed: bool,
+    index: int | None,
     other: Path | None,
     as_json: bool,
     out: Path | None,
@@ -84,6 +91,9 @@ def command(
     a lost scheduler, the same command continues. Several programs with the same --out share the
     work.
     """
+    if index is not None:
+        _compute_one(Plan(load_campaign(campaign)), index, as_json=as_json)
+        return
     if out is None:
         raise click.UsageError("Missing option '--out': the folder of the campaign.")
     plan = plan_of(load_campaign(campaign), out)
@@ -140,6 +150,25 @@ def command(
     click.echo(json.dumps(to_plain(answer), indent=2) if as_json else "\n".join(_lines(found, out)))
     if found.is_complete and found.failed == found.cases:
         raise ResultError(f"All {found.cases:,} cases failed. See {out / 'failed.txt'}.")
+
+
+def _compute_one(plan: Plan, index: int, *, as_json: bool) -> None:
+    """Compute a case here, and print it."""
+    if index >= plan.count:
+        raise InputError(
+            f"--case is {index}, but the campaign has the cases 0 to {plan.count - 1}. Choose one "
+            "of them."
+        )
+    row = compute_case(plan.problem, plan.job(index, ""))
+    if row.error:
+        click.echo(row.traceback.rstrip(), err=True)
+        raise ResultError(f"Case {index} failed: {row.error}")
+    if as_json:
+        found = {"index": index, "parameters": dict(row.values), "results": dict(row.results)}
+        click.echo(json.dumps(to_plain(found), indent=2))
+        return
+    for name, value in {**row.values, **row.results}.items():
+        click.echo(f"{name} = {value:.6g}" if isinstance(value, float) else f"{name} = {value}")
 
 
 def _values(plan: Plan, rows: list[CaseRow]) -> dict[str, dict[str, NDArray[np.float64]]]:

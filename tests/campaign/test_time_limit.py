@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterator
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -96,7 +97,47 @@ def test_the_process_of_a_dask_worker_ends_only_the_case_that_hangs(plan: Plan) 
         assert [(row.index, row.error) for row in again] == [(0, ""), (1, ""), (3, ""), (4, "")]
     finally:
         dask._end_limited(plan.problem)
-    assert not dask._limited
+    assert not any(dask._limited.values())
+
+
+def test_two_campaigns_on_one_thread_keep_their_processes(plan: Plan) -> None:
+    other = replace(plan.problem, seed=plan.problem.seed + 1)
+    try:
+        first, second = (dask._limited_executor(one, 5.0) for one in (plan.problem, other))
+        assert first is not second
+        assert dask._limited_executor(plan.problem, 5.0) is first
+        assert dask._limited_executor(other, 5.0) is second
+        dask._end_limited(other)
+        assert dask._limited_executor(plan.problem, 5.0) is first
+    finally:
+        for one in (plan.problem, other):
+            dask._end_limited(one)
+    assert not any(dask._limited.values())
+
+
+@pytest.mark.long
+def test_on_a_dask_cluster_a_case_that_hangs_fails_and_no_process_is_left(
+    plan: Plan, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    import psutil
+
+    monkeypatch.setenv("PYTHONPATH", str(tmp_path / "package"))  # for the workers
+    folder = tmp_path / "out"
+    open_folder(plan, folder)
+    before = set(psutil.Process().children(recursive=True))
+    found = run_cases(
+        plan, folder, lambda problem, count: dask.DaskExecutor(problem, dask.LOCAL, 1, 5.0),
+        SilentProgress(),
+    )  # fmt: skip
+    assert (found.done, found.failed) == (4, 1)
+    rows = finished_rows(plan, folder)
+    assert [row.results.get("number") for row in rows] == [0.0, 1.0, None, 3.0, 4.0]
+    assert rows[2].error.startswith(ERROR)
+    left = set(psutil.Process().children(recursive=True)) - before
+    psutil.wait_procs(left, 3.0)
+    # Python keeps two processes until this one ends; what they started has their command line
+    names = ["resource_tracker" in str(one.cmdline()) for one in left if one.is_running()]
+    assert names.count(True) <= 1 and names.count(False) <= 1
 
 
 def test_cases_without_a_row_are_computed_again(campaigns: Any, tmp_path: Path) -> None:

@@ -63,8 +63,8 @@ def _silence() -> None:
 # ---- on a worker -------------------------------------------------------------------------------
 
 # A thread of a Dask worker cannot be killed. With a time limit, each thread therefore has a process
-# that computes its cases and is kept for the next chunks.
-_limited: dict[int, tuple[Problem, float, ProcessExecutor]] = {}
+# for each campaign, which computes its cases and is kept for the next chunks.
+_limited: dict[int, list[tuple[Problem, float, ProcessExecutor]]] = {}
 _changing = threading.Lock()
 
 
@@ -83,27 +83,26 @@ def _compute_limited(problem: Problem, jobs: Sequence[Job], limit_s: float) -> l
 
 
 def _limited_executor(problem: Problem, limit_s: float) -> ProcessExecutor:
-    """The executor of this thread, with one process."""
-    own = threading.get_ident()
+    """The executor of this thread for a campaign, with one process."""
     with _changing:
-        old = _limited.pop(own, None)
-        if old is not None and old[:2] == (problem, limit_s):
-            _limited[own] = old
-            return old[2]
-        if old is not None:
-            old[2].close()
+        own = _limited.setdefault(threading.get_ident(), [])
+        for *what, executor in own:
+            if what == [problem, limit_s]:
+                return executor
         # Dask marks its workers as daemons, which Python does not let start processes.
         multiprocessing.current_process().daemon = False
         executor = ProcessExecutor(problem, 1, limit_s)
-        _limited[own] = (problem, limit_s, executor)
+        own.append((problem, limit_s, executor))
         return executor
 
 
 def _end_limited(problem: Problem) -> None:
     """End the processes of all threads of a worker that compute these cases."""
     with _changing:
-        for own in [own for own, (of, *_) in _limited.items() if of == problem]:
-            _limited.pop(own)[2].close()
+        for own in _limited.values():
+            for ended in [one for one in own if one[0] == problem]:
+                own.remove(ended)
+                ended[2].close()
 
 
 # ---- in the program ----------------------------------------------------------------------------
@@ -235,7 +234,9 @@ class DaskExecutor:
             if self._client.status == "running":
                 self._client.cancel(list(self._futures))
                 if self._limit_s is not None:
-                    self._client.run(_end_limited, self._problem, on_error="ignore")
+                    self._client.run(
+                        _end_limited, self._problem, on_error="ignore", wait=False
+                    )  # a worker that hangs cannot hold the command up
             self._client.close(timeout=_GRACE_S)
         except Exception:  # the scheduler is gone; what counts is in the folder
             pass

@@ -145,15 +145,28 @@ def warn_unverified(doubt: str, path: Path) -> None:
         click.echo(f"haselab: unverified numbers: {doubt}. {path}", err=True)
 
 
-def emit(answer: Mapping[str, Any], *, as_json: bool, out: Path | None) -> None:
-    """Print an answer (JSON or readable lines) and, if `out` is given, write its JSON there."""
+def emit(
+    answer: Mapping[str, Any],
+    *,
+    as_json: bool,
+    out: Path | None,
+    shorter: Mapping[str, Any] | None = None,
+) -> None:
+    """Print an answer (JSON or readable lines) and, if `out` is given, write its JSON there.
+
+    Args:
+        answer: all of it.
+        as_json: print JSON.
+        out: file of the JSON.
+        shorter: what the readable lines have in place of long parts of the answer.
+    """
     text = json.dumps(to_plain(answer), indent=2)
     if out is not None:
         write_text(out, text + "\n")
     if as_json:
         click.echo(text)
     else:
-        click.echo("\n".join(readable(answer)))
+        click.echo("\n".join(readable({**answer, **(shorter or {})})))
 
 
 class _BarProgress:

@@ -87,6 +87,23 @@ def test_two_tables_of_two_masses_give_the_law(actuator, tmp_path, capsys):
 
 
 @pytest.mark.long
+def test_each_parameter_and_linear_model_is_one_readable_line(actuator, tmp_path, capsys):
+    file, out = table(tmp_path / "a.csv", 0.3), tmp_path / "answer.json"
+    code, text, _ = run(capsys, file, "--actuator", actuator, *COLUMNS, "--out", out)
+    answer, lines = json.loads(out.read_text()), text.splitlines()
+    assert code == 0 and max(map(len, lines)) <= 120
+    sources = answer["determined_by"]["actuator.permittivity"]
+    (line,) = [one for one in lines if one.startswith("  actuator.permittivity") and " x" in one]
+    assert line.count(" x") == len(sources)
+    assert f"{sources[0]['channel']} x{sources[0]['variance_growth']:.3g}" in line
+    models = answer["linear_models"]
+    shown = [one for one in lines if " V, 0.3 kg " in one]
+    assert len(shown) == len(models) == 5
+    pole = max(models[0]["poles"], key=lambda one: one[1])
+    assert f"{pole[0]:.4g} ± {pole[1]:.4g}i" in shown[0]
+
+
+@pytest.mark.long
 @pytest.mark.parametrize(
     ("options", "words"),
     [

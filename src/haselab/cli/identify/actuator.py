@@ -10,9 +10,10 @@ from pathlib import Path
 
 import click
 import numpy as np
+from numpy.typing import NDArray
 
 from haselab.actuators import ACTUATORS, ActuatorLaw, measured_parameters, with_stated
-from haselab.base import InputError, LimitError
+from haselab.base import InputError, JsonObject, LimitError
 from haselab.cli.actuator_file import load_actuator, save_section
 from haselab.cli.columns import column_options
 from haselab.cli.common import POSITIVE, REAL, actuator_option, answer_options, unverified_option
@@ -129,9 +130,35 @@ def actuator(
     section = section_of_fit(fit, records, gains_v_per_v[0])
     proposals = _proposals(tables, section, fit, actuator)
     listed = {"experiments": [proposal.answer() for proposal in proposals]}
-    emit_fit(fit, inputs, as_json, out, listed)
+    emit_fit(fit, inputs, as_json, out, listed, _shorter(fit))
     save_plot(plot, fit.chart)
     save_section(actuator, "model.physical", section, inputs, status=fit.status)
+
+
+def _shorter(fit: ActuatorFit) -> JsonObject:
+    """One line for each parameter, linear model and law, in place of tables."""
+    return {
+        "determined_by": {
+            name: ", ".join(f"{source.text} x{source.variance_growth:.3g}" for source in sources)
+            for name, sources in fit.determined_by.items()
+        },
+        "linear_models": {
+            f"{point.voltage_v:g} V, {fit.mass_kg:g} kg": f"{point.gain_m_per_v:.4g} m/V, poles "
+            f"{_modes(point.poles)} 1/s"
+            for point in fit.linear_models
+        },
+        "rejected_laws": [
+            f"{rival.law}: log evidence {rival.log_evidence:.4g}" for rival in fit.rejected_laws
+        ],
+    }
+
+
+def _modes(poles: NDArray[np.complex128]) -> str:
+    """Poles in words, a conjugate pair as one."""
+    return ", ".join(
+        f"{pole.real:.4g} ± {pole.imag:.4g}i" if pole.imag else f"{pole.real:.4g}"
+        for pole in poles.tolist() if pole.imag >= 0.0
+    )  # fmt: skip
 
 
 def _warn_of_stated(

@@ -98,14 +98,18 @@ def emit_fit(
     as_json: bool,
     out: Path | None,
     more: Mapping[str, Any] | None = None,
+    shorter: Mapping[str, Any] | None = None,
 ) -> None:
-    """Print the answer and the keys `more`; without a result, end the command with code 3."""
+    """Print the answer and the keys `more`; without a result, end the command with code 3.
+
+    The readable lines have `shorter` in place of long parts of the answer.
+    """
     if not fit.succeeded:
         listed = " ".join(str(file) for file in files)
         if as_json:
             emit(fit.answer(), as_json=True, out=out)
         raise ResultError(f"{fit.status}: {listed}")
-    emit({**fit.answer(), **(more or {})}, as_json=as_json, out=out)
+    emit({**fit.answer(), **(more or {})}, as_json=as_json, out=out, shorter=shorter)
 
 
 @contextmanager

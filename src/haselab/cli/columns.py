@@ -22,6 +22,7 @@ from haselab.store.columns.table import Table
 from haselab.store.columns.units import Unit
 
 __all__ = [
+    "STRAIN",
     "Quantity",
     "advice_on_columns",
     "check_strain",
@@ -31,11 +32,15 @@ __all__ = [
     "note_conversions",
     "note_seconds",
     "note_units",
+    "options_of_each",
+    "strains_of",
 ]
 
 F = TypeVar("F", bound=Callable[..., Any])
 _LARGE_STRAIN = 1.0  # twice the length: without a unit, it is more likely per cent
 _FAR = 10.0  # times a known strain; per cent are 100 times
+_LENGTHS = 0.5, 3.0  # of actuators, over the length at strain 0
+_AT_ZERO = 0.3  # smallest displacement, over the length at strain 0
 
 
 @dataclass(frozen=True)
@@ -66,6 +71,9 @@ class Quantity:
         with open_archive(file) as archive:
             found = next((name for name in self.names if archive.locate(name) is not None), None)
         return found or self.names[0]
+
+
+STRAIN = Quantity("--strain", ("strain",), "1", "the strain, or a displacement with --actuator")
 
 
 def column_option(quantity: Quantity) -> Callable[[F], F]:
@@ -170,6 +178,88 @@ def check_strain(
         f"'{column}=%' if it is in per cent, --unit '{column}=1' if it is a ratio, or name another "
         f"column: {file}"
     )
+
+
+def strains_of(
+    column: str,
+    values: NDArray[np.float64],
+    unit: Unit | None,
+    file: Path,
+    known: ActuatorTables | None = None,
+) -> NDArray[np.float64]:
+    """Strains of a column: as they are, or of displacements or lengths and the length at strain 0.
+
+    Args:
+        column: name of it.
+        values: in SI units. Shape `(N,)`.
+        unit: that it states, or None.
+        file: of the column.
+        known: the actuator's file, with the length at strain 0.
+    Returns:
+        Shape `(N,)`.
+    Raises:
+        InputError: strains that are probably in per cent; no length at strain 0; values that may
+            be neither displacements nor lengths; a unit of another quantity.
+    """
+    if unit is None or unit.si != "m":
+        check_unit(column, unit, STRAIN, file)
+        check_strain(column, values, unit, file, known)
+        return values
+    zero_m = None if known is None else known.actuator.geometry.zero_length_m
+    if zero_m is None:
+        raise InputError(
+            f"Column {column} is in {unit.symbol}, but --strain needs the strain, or a displacement"
+            " and the length at strain 0. State this length as zero_length_m in "
+            f"[actuator.geometry] of an actuator file, and name that with --actuator: {file}"
+        )
+    least, largest = float(np.nanmin(values)), float(np.nanmax(values))
+    if _LENGTHS[0] * zero_m < least and largest < _LENGTHS[1] * zero_m:
+        what, strain = "length / zero_length_m - 1", values / zero_m - 1.0
+    elif float(np.nanmin(np.abs(values))) < _AT_ZERO * zero_m and max(-least, largest) < zero_m:
+        what, strain = "displacement / zero_length_m", values / zero_m
+    else:
+        raise InputError(
+            f"Column {column} is from {least:.4g} to {largest:.4g} m, but the length at strain 0 "
+            f"is zero_length_m = {zero_m:g} m, so it has neither displacements nor lengths. "
+            "Correct zero_length_m, or state the unit of the column with --unit: {file}"
+        )
+    click.echo(
+        f"haselab: strain = {what}, with {zero_m:g} m of the actuator file. {file}", err=True
+    )
+    return np.asarray(strain)
+
+
+def options_of_each(files: Sequence[Path], columns: ColumnOptions) -> list[ColumnOptions]:
+    """What the user states about the columns of each of several files.
+
+    Args:
+        files: tables.
+        columns: about the columns of all of them.
+    Returns:
+        For each file, what is about a column of it.
+    Raises:
+        InputError: no file has the column.
+    """
+    found, names = [], dict[Path, Sequence[str]]()
+    for file in files:
+        with open_archive(file) as archive:
+            has = {
+                name for name in (*columns.units, *([columns.time] if columns.time else []))
+                if archive.locate(name) is not None
+            }  # fmt: skip
+            names[file] = archive.names
+        units = {name: unit for name, unit in columns.units.items() if name in has}
+        found.append(ColumnOptions(columns.time if columns.time in has else None, units))
+    unknown = [f"--unit {name}={unit}" for name, unit in columns.units.items()
+               if not any(name in each.units for each in found)]  # fmt: skip
+    if columns.time is not None and not any(each.time for each in found):
+        unknown.append(f"--time {columns.time}")
+    if unknown:
+        raise InputError(
+            f"{unknown[0]} names no column of the files: "
+            + "; ".join(f"{file} has {', '.join(has)}" for file, has in names.items())
+        )
+    return found
 
 
 def _largest_strains(known: ActuatorTables | None) -> Iterator[tuple[str, float]]:

@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 
 from haselab.base import InputError
 from haselab.cli.actuator_file import save_section
-from haselab.cli.columns import check_strain, check_unit
+from haselab.cli.columns import options_of_each, strains_of
 from haselab.cli.identify.common import CAPACITANCE, STRAIN, name_files_in_errors, read_valid
 from haselab.identify.statics.columns import plausible_capacitance
 from haselab.identify.statics.voltage_map import VoltageMapFit
@@ -21,7 +21,7 @@ from haselab.models.actuator.strain_map import StrainMap
 from haselab.models.actuator.tables import strain_map_section, voltage_map_section
 from haselab.pipelines.sensing.series import derived_series
 from haselab.sensing.strain import fit_strain_map
-from haselab.store.columns.selection import ColumnOptions
+from haselab.store.columns.selection import ColumnOptions, check_assumed_seconds
 from haselab.store.columns.table import Table
 from haselab.store.session.opening import is_session
 from haselab.store.session.reader import SessionReader, session_file
@@ -70,8 +70,8 @@ def read_pairs(
     Returns:
         Both; rows outside the other file's times are left out.
     Raises:
-        InputError: a column is missing, its unit belongs to another quantity, strains without a
-            unit are probably in per cent, or the times of the files hardly overlap.
+        InputError: a column is missing, its unit belongs to another quantity, times or strains
+            without a unit are probably in another one, or the times of the files hardly overlap.
     """
     file, strain_file = files[0], files[-1]
     name = CAPACITANCE.column(file, capacitance_column)
@@ -91,18 +91,20 @@ def read_pairs(
     options = [CAPACITANCE.option, STRAIN.option]
     if len(files) == 1:
         table = other = read_valid(file, [name, strain_name], columns, options)
-        capacitance, strain = table[name], table[strain_name]
     else:
-        table = read_valid(file, [name], columns, options[:1])
-        other = read_valid(strain_file, [strain_name], columns, options[1:])
-        time_s = _times(table, file, columns)
-        known_s = _times(other, strain_file, columns)
+        own, others = options_of_each(files, columns)
+        table = read_valid(file, [name], own, options[:1])
+        other = read_valid(strain_file, [strain_name], others, options[1:])
+    strain = strains_of(
+        strain_name, other[strain_name], other.units[strain_name], strain_file, known
+    )
+    capacitance = table[name]
+    if len(files) == 2:
+        time_s = _times(table, file, own)
+        known_s = _times(other, strain_file, others)
         inside = _common(time_s, known_s, file, strain_file)
-        capacitance = table[name][inside]
-        strain = np.interp(time_s[inside], known_s, other[strain_name])
-    strain_unit = other.units[strain_name]
-    check_unit(strain_name, strain_unit, STRAIN, strain_file)
-    check_strain(strain_name, other[strain_name], strain_unit, strain_file, known)
+        capacitance = capacitance[inside]
+        strain = np.interp(time_s[inside], known_s, strain)
     if in_farads := _in_farads(table, name):
         with name_files_in_errors(file):
             plausible_capacitance(name, capacitance)
@@ -145,6 +147,9 @@ def _strain_of_session(
 def _times(table: Table, file: Path, columns: ColumnOptions) -> Floats:
     """The column of times, even if the file also states its rate."""
     if table.time_s is not None:
+        if table.assumed_seconds and (whole_s := float(np.ptp(table.time_s))) > 0.0:
+            rate_hz = (table.time_s.size - 1) / whole_s
+            check_assumed_seconds(table.time_name or "time_s", rate_hz, file)
         return table.time_s
     name = columns.time or "time_s"
     return read_valid(file, [name], columns, ["--time"])[name]

@@ -14,7 +14,15 @@ from numpy.typing import NDArray
 
 from haselab.base import InputError, JsonObject, ResultError
 from haselab.cli.actuator_file import load_actuator
-from haselab.cli.columns import Quantity, advice_on_columns, check_strain, check_unit, note_units
+from haselab.cli.columns import (
+    STRAIN,
+    Quantity,
+    advice_on_columns,
+    check_strain,
+    check_unit,
+    note_units,
+    strains_of,
+)
 from haselab.cli.common import REAL, emit
 from haselab.cli.options import shared_option
 from haselab.identify.record import Record
@@ -63,7 +71,6 @@ OUTPUT = shared_option("--output", default="y", show_default=True)
 _COPY = 0.9  # share of the samples of a record, above which it is a copy of another one
 
 STRETCH = Quantity("--stretch", ("stretch",), "1", "the stretch")
-STRAIN = Quantity("--strain", ("strain",), "1", "the strain")
 VOLTAGE = Quantity("--voltage", ("voltage_v", "voltage"), "V", "the voltage")
 CAPACITANCE = Quantity(
     "--capacitance",
@@ -204,7 +211,8 @@ def read_recorded(
         columns: what the user states about the columns.
         hold: how the input behaves between its updates; None: not stated, so held is assumed.
         through: actuator file whose voltage map converts the input from V to strain. The input is
-            then a commanded voltage, which is held.
+            then a commanded voltage, which is held. An output in m is converted to strain, too, if
+            the file has the length at strain 0.
     Returns:
         The records.
     Raises:
@@ -219,9 +227,14 @@ def read_recorded(
                 f"--through-voltage-map converts a voltage, but column {names[0]} is "
                 f"{unit_text(units[0])}. Leave out the option, or name another column: {file}"
             )
-        to_volt = load_actuator(through).voltage_map()
-        strain = to_volt.strain(table[names[0]])
-        table, units = replace(table, columns={**table.columns, names[0]: strain}), ("1", units[1])
+        known = load_actuator(through)
+        changed = {names[0]: known.voltage_map().strain(table[names[0]])}
+        units = "1", units[1]
+        if units[1] == "m" and known.actuator.geometry.zero_length_m is not None:
+            output, stated = names[1], table.units[names[1]]
+            changed[output] = strains_of(output, table[output], stated, file, known)
+            units = "1", "1"
+        table = replace(table, columns={**table.columns, **changed})
     assumed = hold is None and held_at_hz is None and through is None
     hold = "zero" if hold is None else hold
     time_s = table.time_s if table.rate_hz is None else None
@@ -308,20 +321,23 @@ def read_quantities(
         file: the file.
         wanted: the column that the user named for each quantity, or None.
         columns: what the user states about the columns.
-        known: the actuator's file, with which strains are compared.
+        known: the actuator's file, with which strains are compared, and by whose length at strain
+            0 displacements are divided.
     Returns:
         Values of each. Shape `(N,)`.
     Raises:
-        InputError: a column is missing, its unit belongs to another quantity, or strains without
-            a unit are probably in per cent.
+        InputError: a column is missing, its unit belongs to another quantity, or see `strains_of`.
     """
     names = {quantity: quantity.column(file, given) for quantity, given in wanted.items()}
     table = read_valid(file, list(names.values()), columns, [each.option for each in names])
+    found = []
     for quantity, name in names.items():
-        check_unit(name, table.units[name], quantity, file)
         if quantity is STRAIN:
-            check_strain(name, table[name], table.units[name], file, known)
-    return tuple(table[name] for name in names.values())
+            found.append(strains_of(name, table[name], table.units[name], file, known))
+        else:
+            check_unit(name, table.units[name], quantity, file)
+            found.append(table[name])
+    return tuple(found)
 
 
 def _check_units(table: Table, names: Sequence[str], file: Path) -> None:

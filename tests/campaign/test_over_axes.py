@@ -152,6 +152,12 @@ def test_differences_along_an_axis_are_those_of_the_same_devices(campaigns: Any)
     assert third["least"] > 49.0
     page = campaign_page(summary, {})
     assert "Differences along case.noise_std" in page
+    assert "case.noise_std</th><td>0.01, 0.02, 0.04</td><td>each</td>" in page
+    assert "case.gain</th><td>0.4, 0.6</td><td>uniform</td>" in page and "duration_s = 1" in page
+    ranks = page[page.index("Sensitivity: rank correlation") :]
+    gain, frequency = (ranks.index(f"<td>case.{name}</td>")
+                       for name in ("gain", "natural_frequency_rad_s"))  # fmt: skip
+    assert gain < frequency, "the gain matters most"
     shared = campaigns.plan(text.replace("samples = 64", "samples = 64\nrepeats = 2"))
     shared_rows = campaigns.rows_of(shared, lambda noise_std, *_: noise_std)
     (found,) = summarised(shared, shared_rows)["along_axes"]

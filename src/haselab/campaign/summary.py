@@ -132,6 +132,8 @@ def summarised(plan: Plan, rows: Sequence[CaseRow]) -> JsonObject:
         "kind": campaign.kind,
         "code": plan.code,
         "design": campaign.design.model_dump(mode="json"),
+        "parameters": described["parameters"],
+        "settings": described["tables"]["case"],
         "cases": len(rows),
         "failed": sum(bool(row.error) for row in rows),
         "is_random": drawn,

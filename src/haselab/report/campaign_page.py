@@ -141,6 +141,17 @@ def _shares(values: Floats, label: str) -> Curve:
 
 def _tables(summary: Mapping[str, Any]) -> Iterator[_Table]:
     yield _Table(
+        "Parameters", f"What was varied. {_settings(summary)}",
+        ("Parameter", "Values", "How"),
+        [
+            (path, ", ".join(map(_shown, numbers)), shape)
+            for path, chosen in summary["parameters"].items()
+            for shape, numbers in (
+                chosen.items() if isinstance(chosen, Mapping) else [("each", chosen)]
+            )
+        ],
+    )  # fmt: skip
+    yield _Table(
         "Results", "Numbers in brackets are intervals of 95 %.",
         ("Result", "Axes", "Cases", "Without a value", "Smallest", "5 %", "Median", "95 %",
          "Largest"),
@@ -208,6 +219,14 @@ def _tables(summary: Mapping[str, Any]) -> Iterator[_Table]:
             (one["result"], *_differing(one)) for one in summary.get("paired", ())
         ],
     )  # fmt: skip
+
+
+def _settings(summary: Mapping[str, Any]) -> str:
+    fixed = [
+        f"{name} = {_shown(value)}" for name, value in summary["settings"].items()
+        if f"case.{name}" not in summary["parameters"]
+    ]  # fmt: skip
+    return f"The other settings of [case]: {', '.join(fixed)}." if fixed else ""
 
 
 def _over(found: Sequence[Mapping[str, Any]]) -> Iterator[_Table]:
@@ -333,7 +352,7 @@ def _sensitivities(found: Sequence[Mapping[str, Any]]) -> Iterator[_Table]:
         [
             (one["result"], one["group"], one["parameter"], _with_interval(one["first"]),
              _with_interval(one["total"]), str(one["blocks"]), str(one["blocks_left_out"]))
-            for one in found if "first" in one
+            for one in _largest_first([one for one in found if "first" in one], "total")
         ],
     )  # fmt: skip
     yield _Table(
@@ -344,9 +363,17 @@ def _sensitivities(found: Sequence[Mapping[str, Any]]) -> Iterator[_Table]:
         [
             (one["result"], one["group"], one["parameter"], _with_interval(one["correlation"]),
              str(one["count"]), str(one["without_value"]))
-            for one in found if "correlation" in one
+            for one in _largest_first([one for one in found if "correlation" in one], "correlation")
         ],
     )  # fmt: skip
+
+
+def _largest_first(found: Sequence[Mapping[str, Any]], key: str) -> list[Mapping[str, Any]]:
+    """The parameters of each result and group, the most important first."""
+    places = {name: k for k, name in enumerate(dict.fromkeys(one["result"] for one in found))}
+    return sorted(
+        found, key=lambda one: (places[one["result"]], one["group"], -abs(one[key]["value"]))
+    )
 
 
 def _with_interval(number: Mapping[str, Any] | None) -> str:

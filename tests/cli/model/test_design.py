@@ -204,3 +204,22 @@ def test_margins_of_a_derivative_without_its_filter_say_so(model, capsys):
     code, _, error = run(capsys, *words)
     assert code == 0 and "the derivative is not filtered" in error and error.count("\n") == 1
     assert run(capsys, *words, "--derivative-filter-s", 0.02)[::2] == (0, "")
+
+
+def test_limits_that_nobody_stated_are_named_if_the_drive_reaches_further(model, tmp_path, capsys):
+    """The map of eq. 4 of the paper reaches a strain of 0.069 at 1.6 V, and 0.133 at 2 V."""
+    path = tmp_path / "A.toml"
+    assert run(capsys, "design", model, "--out", path)[0] == 0
+    text = path.read_text()
+    kept = text[: text.index("[controller.limits]")]
+    for high_v, named in ((2.0, True), (1.6, False)):
+        path.write_text(
+            f"{kept}\n[drive]\nlow_v = 0.0\nhigh_v = {high_v}\n[drive.voltage_map]\n"
+            "a1_v = 1.324\nb1 = 3.124\na2_v = -0.2805\nb2 = -26.92\n"
+            "strain_low = -0.04\nstrain_high = 0.3\nresidual_v = 0.01\n"
+        )
+        code, _, error = run(capsys, "design", path, "--json")
+        assert code == 0 and ("No limits are stated" in error) == named
+        if named:
+            assert "strains of -0.05 to 0.1; the voltage map reaches -0.04 to 0.133" in error
+            assert run(capsys, "design", path, "--json", "--limits", "-0.04", "0.05")[2] == ""

@@ -46,6 +46,7 @@ from haselab.pipelines.design.sections import (
     CONTROLLER_KEYS,
     MODEL_KEYS,
     controller_section,
+    default_limits_note,
     demands_of,
     limits_of,
     other_controllers,
@@ -127,7 +128,10 @@ def command(
     plant = read_any_plant(model)
     demands = demands_of(model, spec)
     rate_hz, delay_s = loop_of(model, loop["rate_hz"], loop["delay_s"])
-    setting = LoopSetting(rate_hz, delay_s, limits_of(model, loop["limits"]))
+    limits = limits_of(model, loop["limits"])
+    if note := default_limits_note(model, loop["limits"], limits):
+        click.echo(f"haselab: {note}", err=True)
+    setting = LoopSetting(rate_hz, delay_s, limits)
     if posterior is None and loop["probability"] is not None:
         raise InputError(
             f"--probability {loop['probability']:g} needs the covariance of the model, which the "

@@ -19,8 +19,8 @@ _BETTER = 50.0  # twice the gain of logarithmic likelihood that identifies a lim
 _FOLLOWS = 0.3  # slope of the outputs beyond a limit over the prediction; 0 where they are clipped
 _EXTREME = 0.999  # of the outputs lie below the limit plus ...
 _CLEAR = 4.0  # ... this many standard deviations of the noise
-_CONSTANT = 3.0  # largest deviation of the outputs at a limit over their white noise, or ...
-_FLAT = 0.3  # ... over the deviation of the prediction there
+_CONSTANT = 2.0  # largest median deviation from a limit over the white noise, or ...
+_FLAT = 0.1  # ... over the deviation of the prediction there
 _EXPLAINED = 0.1  # largest share of the outputs' energy in the residuals
 _LEAST_ROWS = 10
 _LEAST_VISITS = 2
@@ -92,7 +92,7 @@ def _rail(y: Floats, predicted: Floats) -> float | None:
         if extreme - rail > _CLEAR * float(there.std()):
             continue  # an extreme value that is reached often, not a limit
         steady = max(_CONSTANT * _white(y, beyond), _FLAT * float(modelled.std()))
-        if float(there.std()) > steady:
+        if float(np.median(np.abs(there - rail))) > steady:
             continue  # a curve, such as the trough of a response to the square of a voltage
         off = float(((there - modelled) ** 2).sum())
         limited = float(((there - rail) ** 2).sum())

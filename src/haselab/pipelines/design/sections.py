@@ -23,6 +23,7 @@ __all__ = [
     "CONTROLLER_KEYS",
     "MODEL_KEYS",
     "controller_section",
+    "default_limits_note",
     "demands_of",
     "limits_of",
     "model_section",
@@ -38,6 +39,7 @@ CONTROLLER_KEYS = (
     "kind", "name", "parameters", "limits", "loop", "margins", "demands", "predicted", "plausible",
     "uncertainty", "alternatives",
 )  # fmt: skip
+_CLOSE = 1e-3  # strain
 _DEFAULT = (Saturation().low, Saturation().high)  # strain, the study's
 _NO_UNCERTAINTY = "no uncertainty: [model] has no covariance"
 
@@ -131,6 +133,34 @@ def limits_of(path: Path, given: tuple[float, float] | None) -> Saturation:
     if drive.voltage_map is None or ends_v == (None, None):
         return wanted
     return reachable_range(wanted, drive.voltage_map.map(), *ends_v)
+
+
+def default_limits_note(path: Path, given: tuple[float, float] | None, used: Saturation) -> str:
+    """Say that nobody stated the limits, if the drive reaches further than they do.
+
+    Args:
+        path: of the model.
+        given: on the command line.
+        used: see `limits_of`.
+    Returns:
+        A sentence; empty if the limits are stated, or the reach is not known.
+    """
+    if given is not None or path.suffix.lower() != ".toml":
+        return ""
+    known = read_tables(path)
+    stated = known.controller is not None and known.controller.limits is not None
+    if stated or known.drive.voltage_map is None or known.drive_ends_v() == (None, None):
+        return ""
+    to_volt = known.voltage_map()
+    map_ends = (min(to_volt.strain_low, 0.0), max(to_volt.strain_high, 0.0))
+    reach = reachable_range(Saturation(*map_ends), to_volt, *known.drive_ends_v())
+    if reach.low > used.low - _CLOSE and reach.high < used.high + _CLOSE:
+        return ""
+    return (
+        f"No limits are stated, so set-points are limited to strains of {used.low:.3g} to "
+        f"{used.high:.3g}; the voltage map reaches {reach.low:.3g} to {reach.high:.3g}. State them "
+        f"with --limits LOW HIGH. {path}"
+    )
 
 
 def controller_section(design: Design, kind: str) -> dict[str, object]:

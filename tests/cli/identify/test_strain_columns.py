@@ -1,0 +1,141 @@
+"""Strains in another file than the capacitances: units, displacements and lengths."""
+
+import json
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from haselab.cli.main import main
+from haselab.models import Plant
+
+ZERO_M, SLOPE_PER_F = 0.06, 8e8
+RNG = np.random.default_rng(1)
+TIME_S = 0.002 * np.arange(4000)
+STRAIN = 0.1 - 0.1 * np.cos(2.0 * np.pi * 0.25 * TIME_S)
+ACTUATOR = f'[actuator]\nkind = "planar-hasel"\n[actuator.geometry]\nzero_length_m = {ZERO_M}\n'
+
+
+@pytest.fixture
+def capacitance(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+    monkeypatch.chdir(tmp_path)
+    Path("A.toml").write_text(ACTUATOR)
+    farad = 5e-10 + STRAIN / SLOPE_PER_F + 1e-14 * RNG.standard_normal(STRAIN.size)
+    rows = np.column_stack([TIME_S[::5], farad[::5]])
+    np.savetxt("C.csv", rows, "%.9g", ",", header="time_s,capacitance_f", comments="")
+    return Path("C.csv")
+
+
+def strain_file(header: str, time_scale: float, values: np.ndarray) -> Path:
+    rows = np.column_stack([time_scale * TIME_S, values])
+    np.savetxt("S.csv", rows, "%.9g", ";", header=header, comments="")
+    return Path("S.csv")
+
+
+def fitted(capsys: pytest.CaptureFixture[str], *options: str) -> tuple[int, str, str]:
+    words = ["identify", "capacitance-map", "C.csv", "--strain-file", "S.csv", *options]
+    with pytest.raises(SystemExit) as stop:
+        main(words)
+    printed = capsys.readouterr()
+    return int(str(stop.value.code)), printed.out, printed.err
+
+
+def slope(printed: str) -> float:
+    return float(next(line for line in printed.splitlines() if line.startswith("slope")).split()[1])
+
+
+@pytest.mark.parametrize(
+    ("header", "time_scale", "scale", "offset", "options", "said"),
+    [
+        ("t;x", 1.0, 1.0, 0.0, ("--strain", "x"), ""),
+        ("Zeit [ms];x", 1e3, 100.0, 0.0, ("--strain", "x", "--unit", "x=%"), "from % to"),
+        ("Zeit;x", 1e3, 1.0, 0.0, ("--strain", "x", "--unit", "Zeit=ms"), ""),
+        ("clock;x", 1e3, 1.0, 0.0,
+         ("--strain", "x", "--time", "clock", "--unit", "clock=ms"), ""),
+        ("t;Laser [mm]", 1.0, 1e3 * ZERO_M, 0.0,
+         ("--strain", "Laser", "--actuator", "A.toml"), "strain = displacement / zero_length_m"),
+        ("t;Laser [mm]", 1.0, 1e3 * ZERO_M, 1e3 * ZERO_M,
+         ("--strain", "Laser", "--actuator", "A.toml"), "strain = length / zero_length_m - 1"),
+    ],
+)  # fmt: skip
+def test_the_slope_is_that_of_the_strain(
+    capacitance: Path, capsys: pytest.CaptureFixture[str], header: str, time_scale: float,
+    scale: float, offset: float, options: tuple[str, ...], said: str,
+) -> None:  # fmt: skip
+    """Within 1 %: the noise of the capacitance is 4e-5 of its span."""
+    strain_file(header, time_scale, offset + scale * STRAIN)
+    code, out, err = fitted(capsys, *options)
+    assert code == 0 and said in err
+    assert slope(out) == pytest.approx(SLOPE_PER_F, rel=0.01)
+
+
+@pytest.mark.parametrize(
+    ("header", "time_scale", "values", "options", "said"),
+    [
+        ("Zeit;x", 1e3, STRAIN, ("--strain", "x"), "in milliseconds 500. State which"),
+        ("t;x", 1.0, STRAIN, ("--strain", "x", "--unit", "y=%"),
+         "y=% names no column of the files: C.csv has time_s, capacitance_f; S.csv has t, x"),
+        ("t;x", 1.0, STRAIN, ("--strain", "x", "--time", "u"), "--time u names no column of the"),
+        ("t;x [mm]", 1.0, 60.0 * STRAIN, ("--strain", "x"), "State this length as zero_length_m"),
+        ("t;x [mm]", 1.0, 60.0 * STRAIN + 25.0, ("--strain", "x", "--actuator", "A.toml"),
+         "neither displacements nor lengths"),
+        ("t;x [V]", 1.0, STRAIN, ("--strain", "x"), "is in V, but --strain needs the strain"),
+    ],
+)  # fmt: skip
+def test_what_is_no_strain_is_refused_in_one_line(
+    capacitance: Path, capsys: pytest.CaptureFixture[str], header: str, time_scale: float,
+    values: np.ndarray, options: tuple[str, ...], said: str,
+) -> None:  # fmt: skip
+    strain_file(header, time_scale, values)
+    before = Path("A.toml").read_text()
+    code, out, err = fitted(capsys, *options)
+    assert code == 2 and out == "" and said in err.splitlines()[-1]
+    assert Path("A.toml").read_text() == before
+
+
+def test_a_voltage_map_takes_displacements_too(
+    capacitance: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    volt = np.sqrt(STRAIN / 0.06)
+    for name, values in (("D.csv", 1e3 * ZERO_M * STRAIN), ("E.csv", STRAIN)):
+        unit = " [mm]" if name == "D.csv" else ""
+        np.savetxt(name, np.column_stack([volt, values]), "%.9g", ",", header=f"U,x{unit}",
+                   comments="")  # fmt: skip
+    found = []
+    for name in ("D.csv", "E.csv"):
+        with pytest.raises(SystemExit) as stop:
+            main(["identify", "voltage-map", name, "--voltage", "U", "--strain", "x", "--actuator",
+                  "A.toml"])  # fmt: skip
+        assert stop.value.code == 0
+        lines = capsys.readouterr().out.splitlines()
+        found.append([line.split()[1] for line in lines if line[:2] in ("a1", "b1", "a2", "b2")])
+    assert found[0] == found[1] and found[0]
+
+
+def test_through_the_voltage_map_a_displacement_has_the_model_of_its_strain(
+    capacitance: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """The static law of the map, then a resonance at 20 rad/s; noise of 1e-4 of the strain."""
+    volt = np.sqrt(STRAIN / 0.06)
+    np.savetxt("U.csv", np.column_stack([volt, STRAIN]), "%.9g", ",", header="U,x", comments="")
+    main_ok("identify", "voltage-map", "U.csv", "--voltage", "U", "--strain", "x", "--actuator",
+            "A.toml")  # fmt: skip
+    capsys.readouterr()
+    u = 1.2 + 0.3 * np.repeat(RNG.choice([-1.0, 1.0], 100), 20)
+    time_s = 0.01 * np.arange(u.size)
+    strain = 0.06 * Plant(1.0, 20.0, 0.1, 0.0).simulate(u**2 - u[0] ** 2, 100.0, time_s)
+    strain += 1e-4 * RNG.standard_normal(u.size)
+    gains = []
+    for unit, scale in (("1", 1.0), ("mm", 1e3 * ZERO_M)):
+        np.savetxt("R.csv", np.column_stack([time_s, u, scale * strain]), "%.9g", ",",
+                   header=f"time_s,U,x [{unit}]", comments="")  # fmt: skip
+        main_ok("identify", "transfer", "R.csv", "--input", "U", "--output", "x",
+                "--through-voltage-map", "--actuator", "A.toml", "--json", "--force")  # fmt: skip
+        gains.append(json.loads(capsys.readouterr().out)["gain"]["value"])
+    assert gains[0] == pytest.approx(gains[1], rel=1e-6)
+
+
+def main_ok(*words: str) -> None:
+    with pytest.raises(SystemExit) as stop:
+        main(list(words))
+    assert stop.value.code == 0

@@ -133,7 +133,7 @@ def summarised(plan: Plan, rows: Sequence[CaseRow]) -> JsonObject:
         "code": plan.code,
         "design": campaign.design.model_dump(mode="json"),
         "parameters": described["parameters"],
-        "settings": described["tables"]["case"],
+        "settings": campaign.tables["case"],
         "cases": len(rows),
         "failed": sum(bool(row.error) for row in rows),
         "is_random": drawn,

@@ -55,9 +55,22 @@ class ControllerDesign(Experiment[Control]):
             np.random.default_rng(_SEED), measured_latency(opened, analysis.rig),
             analysis.repeated(Loops),
         )  # fmt: skip
-        return ExperimentResult(
-            found.quantities, found.notes, figures=found.figures, values=(found,)
-        )
+        notes = dict(found.notes)
+        for key in found.quantities:
+            if unplayed := self._unplayed(key):
+                notes[key] = "; ".join(filter(None, (notes.get(key, ""), unplayed)))
+        return ExperimentResult(found.quantities, notes, figures=found.figures, values=(found,))
+
+    def _unplayed(self, key: str) -> str:
+        """Say that a loop of S21 was computed and not played; empty if it was played."""
+        trials = self.study.steps
+        if not key.startswith("S21.") or key.startswith("S21.plant_"):
+            return ""
+        delayed = key.startswith("S21.delayed_")
+        if trials.extra_delay_trials if delayed else trials.pi_trials:
+            return ""
+        name = "extra_delay_trials" if delayed else "pi_trials"
+        return f"computed for the PI of [control] and not played ({name} = 0)"
 
     def rows(self) -> Mapping[str, Quantity]:
         """See `Experiment`."""

@@ -7,7 +7,7 @@ from scipy.signal import csd, max_len_seq, welch
 from haselab.base import InputError
 from haselab.identify.frequency.response import estimate_frequency_response
 from haselab.identify.record import Record
-from haselab.models import Plant
+from haselab.models import Plant, SlowMode
 
 OMEGA = float(np.sqrt(26.14))
 PLANT = Plant(0.5, OMEGA, 0.93 / (2 * OMEGA))
@@ -351,6 +351,20 @@ def test_a_clipped_output_has_no_result_and_an_unclipped_one_has(drive, more):
     # The median of rows whose noise is normal: known to a tenth of its deviation with 100 of them.
     limit = float(response.status.split("stays at ")[1].split()[0])
     assert abs(limit - 1.0 - half) < 0.5 * float(noise.std()) + 1e-3
+
+
+@pytest.mark.parametrize("seed", range(3))
+def test_a_response_to_the_square_of_a_voltage_is_not_clipped(seed):
+    """3 s at 0 V, a step to 3 V with creep, then a chirp: its troughs are flatter, but no limit."""
+    time_s = np.arange(12500) / 250.0
+    chirped_s = np.clip(time_s - 20.0, 0.0, None)
+    rate = np.log(100.0) / 30.0
+    phase = 2.0 * np.pi * 0.1 * (np.exp(rate * chirped_s) - 1.0) / rate
+    u = np.where(time_s < 3.0, 0.0, 3.0) + 0.8 * np.sin(phase)
+    plant = Plant(1.0, 2.0 * np.pi * 3.0, 0.12, 0.0, (SlowMode(0.7, 4.0),))
+    y = 0.43e-3 * plant.simulate(u**2, 250.0, time_s)
+    y += 1e-5 * np.random.default_rng(seed).normal(size=y.size)
+    assert estimate(u, y, 250.0).status == "ok"
 
 
 @pytest.mark.parametrize("drive", ["step", "sparse multisine"])

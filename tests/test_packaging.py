@@ -15,6 +15,7 @@ from types import ModuleType
 import pytest
 
 import haselab
+from haselab.pipelines.examples.packages import PACKAGES
 
 ROOT = Path(__file__).resolve().parents[1]
 PACKAGING = ROOT / "packaging"
@@ -85,12 +86,19 @@ def test_a_wheel_contains_everything_that_runs(
     code = (
         "from haselab.rig.chip import board_names, source_folder\n"
         "from haselab.pipelines.examples.data_sets import find_data_set\n"
-        "print(source_folder(), *board_names(), *find_data_set('bench').tables())"
+        "print(source_folder(), *board_names(), *find_data_set('bench').tables())\n"
+        "from pathlib import Path\n"
+        "from haselab.pipelines.examples.packages import PACKAGES, write_package\n"
+        "print(*(len(write_package(name, Path(name))) for name in PACKAGES))"
     )
     found = run([sys.executable, "-S", "-c", code], tmp_path, PYTHONPATH=paths).split()
-    assert found == [
+    kinds = "**/*.py", "**/*.c", "**/*.toml", "**/*.md"
+    folders = [ROOT / "examples" / "plugins" / name for name in PACKAGES]
+    counts = [sum(len(list(folder.glob(kind))) for kind in kinds) for folder in folders]
+    assert found[-len(counts) :] == list(map(str, counts))
+    assert found[: -len(counts)] == [
         str(tmp_path / "site" / "haselab" / "sources"), "atmega2560", "stm32g071", "bench.toml",
-        "twin-hz.toml", "twin-rad.toml",
+        "twin-hz.toml", "twin-rad.toml", "reference-study.toml",
     ]  # fmt: skip
 
 

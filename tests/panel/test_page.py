@@ -70,7 +70,9 @@ def test_stop_acts_when_the_pointer_goes_down(page: Page) -> None:
     assert box is not None
     page.mouse.move(box["x"] + 20, box["y"] + 20)
     page.mouse.down()  # and not up
-    expect(page.locator("#emergency-state")).to_have_text("STOP: 0 V commanded", timeout=WAIT_MS)
+    expect(page.locator("#emergency-state")).to_contain_text(
+        "STOP: 0 V commanded at ", timeout=WAIT_MS
+    )
     expect(page.locator("header")).to_contain_text("Bench: tripped", timeout=WAIT_MS)
     page.mouse.up()
     # Recovery is a procedure on the page.
@@ -93,7 +95,7 @@ def test_stop_needs_nothing_but_its_page_and_acts_on_a_click_without_a_pointer(
         state = found.locator("#emergency-state")
         expect(state).to_have_text("STOP: ready", timeout=WAIT_MS)
         found.locator("#emergency").evaluate("button => button.click()")
-        expect(state).to_have_text("STOP: 0 V commanded", timeout=WAIT_MS)
+        expect(state).to_contain_text("STOP: 0 V commanded at ", timeout=WAIT_MS)
         expect(found.locator("header")).to_contain_text("Bench: tripped", timeout=WAIT_MS)
 
 

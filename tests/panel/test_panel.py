@@ -186,7 +186,7 @@ def test_the_loop_of_an_actuator_file_follows_the_desired_strain(actuator_file: 
             await page.until(lambda state: state["loop"] == [-0.04, 0.1])
             await page.arm(1.9)
             refused = await page.ask("loop", strain=0.2)
-            assert "limits of the controller are -0.04 to 0.1" in refused["error"]
+            assert "limits of the controller are -4 to 10 %" in refused["error"]
             assert "error" not in await page.ask("loop", strain=0.03)
             await page.until(lambda state: state["mode"] == "loop" and state["drive_v"] > 1.0)
             assert "error" not in await page.ask("open")

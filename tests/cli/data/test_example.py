@@ -12,6 +12,7 @@ import pytest
 from haselab.cli.main import main
 from haselab.pipelines.examples import recordings
 from haselab.pipelines.examples.data_sets import DATA_SETS
+from haselab.pipelines.examples.packages import PACKAGES
 from haselab.rig.twin.config import twin_of_reading
 from haselab.store.columns.table import read_table
 
@@ -24,7 +25,8 @@ def code_of(*arguments: object) -> int:
 
 def test_the_examples_are_listed(capsys):
     assert code_of("example", "--json") == 0
-    assert list(json.loads(capsys.readouterr().out)) == [each.name for each in DATA_SETS]
+    listed = list(json.loads(capsys.readouterr().out))
+    assert listed == [*(each.name for each in DATA_SETS), *PACKAGES]
     assert code_of("example") == 0
     assert "Write one with: haselab example NAME --out DIR" in capsys.readouterr().out
 
@@ -34,7 +36,8 @@ def test_the_examples_are_listed(capsys):
     [
         (("chrip", "--out", "x"), "There is no example 'chrip'. Use one of monitors, cycles"),
         (("chirp",), "Missing option '--out'"),
-        (("--out", "x"), "--out needs the NAME of a data set"),
+        (("--out", "x"), "--out needs the NAME of an example"),
+        (("haselab-mysupply",), "Missing option '--out': the folder for the example haselab-my"),
     ],
 )
 def test_bad_use_is_one_line(tmp_path, monkeypatch, capsys, words, said):
@@ -43,6 +46,17 @@ def test_bad_use_is_one_line(tmp_path, monkeypatch, capsys, words, said):
     printed = capsys.readouterr().err
     assert said in printed and printed.count("\n") == 1
     assert list(tmp_path.iterdir()) == []
+
+
+@pytest.mark.parametrize("name", PACKAGES)
+def test_a_package_is_a_copy_of_the_example_that_the_tests_install(tmp_path, capsys, name):
+    source = Path(__file__).resolve().parents[3] / "examples" / "plugins" / name
+    assert code_of("example", name, "--out", tmp_path / "mine", "--json") == 0
+    files = [Path(file) for file in json.loads(capsys.readouterr().out)["files"]]
+    assert {"pyproject.toml", "README.md"} <= {file.name for file in files}
+    assert not any("__pycache__" in file.parts for file in files)
+    for file in files:
+        assert file.read_bytes() == (source / file.relative_to(tmp_path / "mine")).read_bytes()
 
 
 @pytest.mark.parametrize("name", [each.name for each in DATA_SETS])

@@ -75,7 +75,9 @@ def test_the_commands_of_the_page_do_what_it_says(lab: Lab) -> None:
     before = lab.shell.run("haselab rig check bench.toml")
     assert before.returncode == 2
     assert "no supply of kind 'mysupply'; use one of 'petapicovoltron', or install" in before.stderr
-    assert [command.split()[0] for command in COMMANDS] == ["cp", "pip", "python", *["haselab"] * 4]
+    assert [command.split()[0] for command in COMMANDS] == [
+        "haselab", "pip", "python", *["haselab"] * 4
+    ]  # fmt: skip
     told = {}
     for command in COMMANDS:
         if "rig safe" in command:

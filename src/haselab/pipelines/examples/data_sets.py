@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass
 from importlib import resources
 from pathlib import Path
@@ -116,7 +116,11 @@ def _bench() -> dict[str, str]:
 
     folder = source_folder() / "rigs"
     names = ("bench.toml", "twin-hz.toml", "twin-rad.toml")
-    return {name: (folder / name).read_text(encoding="utf-8") for name in names}
+    studies = resources.files("haselab.study") / "studies"
+    return {
+        **{name: (folder / name).read_text(encoding="utf-8") for name in names},
+        "reference-study.toml": (studies / "hasel-iros2018.toml").read_text(encoding="utf-8"),
+    }
 
 
 DATA_SETS: tuple[DataSet, ...] = (
@@ -230,10 +234,11 @@ DATA_SETS: tuple[DataSet, ...] = (
     ),
     DataSet(
         "bench",
-        "Rig files of the simulated bench",
+        "Rig files of the simulated bench, and the reference study",
         "`bench.toml` is a rig for every command with `--rig` or RIG.toml, such as `haselab panel "
         "--rig bench.toml` and `haselab twin serve bench.toml --out served.toml`. `twin-hz.toml` "
-        "and `twin-rad.toml` hold the physical parameters, which you may change.",
+        "and `twin-rad.toml` hold the physical parameters, which you may change. "
+        "`reference-study.toml` is the study of `haselab reproduce`, to copy from.",
         _bench,
         (
             "rig check bench.toml --out check.json",
@@ -243,11 +248,12 @@ DATA_SETS: tuple[DataSet, ...] = (
 )
 
 
-def find_data_set(name: str) -> DataSet:
+def find_data_set(name: str, names: Iterable[str] | None = None) -> DataSet:
     """Return the data set with a name.
 
     Args:
         name: of the data set.
+        names: that the message lists if there is none; None: those of all data sets.
     Returns:
         The data set.
     Raises:
@@ -256,8 +262,8 @@ def find_data_set(name: str) -> DataSet:
     for data_set in DATA_SETS:
         if data_set.name == name:
             return data_set
-    names = ", ".join(data_set.name for data_set in DATA_SETS)
-    raise InputError(f"There is no example '{name}'. Use one of {names}.")
+    names = names or (data_set.name for data_set in DATA_SETS)
+    raise InputError(f"There is no example '{name}'. Use one of {', '.join(names)}.")
 
 
 def write_data_set(data_set: DataSet, folder: Path) -> list[Path]:

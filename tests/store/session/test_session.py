@@ -342,6 +342,18 @@ def test_a_write_that_hdf5_refuses_is_a_device_error(tmp_path, monkeypatch, meth
         np.testing.assert_array_equal(reader.experiment("a").codes, blocks_of(1))
 
 
+def test_a_file_that_is_deleted_while_it_is_recorded_is_named(tmp_path):
+    session = SessionWriter(tmp_path / "s.h5", PLANS, SAMPLES, HEADER)
+    (tmp_path / "s.h5").unlink()
+    with pytest.raises(DeviceError, match=r"was deleted or moved while it was recorded.*s\.h5$"):
+        for _ in range(2000):
+            session.append_block("a", blocks_of(1)[0], 0.0, 0.0, 0.0)
+            session.flush("a")
+    with contextlib.suppress(DeviceError):
+        session.close()
+    assert list(tmp_path.iterdir()) == []
+
+
 def test_a_place_that_cannot_hold_a_session_is_a_device_error(tmp_path):
     (tmp_path / "file").write_text("")
     with pytest.raises(DeviceError, match=r"cannot be written \(.*session\.h5$"):

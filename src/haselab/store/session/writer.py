@@ -129,6 +129,7 @@ class SessionWriter:
         self._pending = {plan.name: _Pending() for plan in plans}
         self._current = ""
         self._failure: DeviceError | None = None
+        self._opened = False
         self._datasets: dict[str, GrowingDataset] = {}
         texts = [self._text(plan.name, plan.settings) for plan in plans]
         with ExitStack() as undo:
@@ -150,6 +151,7 @@ class SessionWriter:
             self._read_tail = TailReader(self._file, path)
             self._synced_s = self._queue.clock_s()
             self._jobs = JobQueue(self._queue, self._behind)
+            self._opened = True
             undo.pop_all()
 
     def _claimed(self, path: Path) -> io.FileIO:
@@ -190,6 +192,11 @@ class SessionWriter:
     def _failed(self, error: BaseException) -> DeviceError:
         if isinstance(error, DeviceError):
             return error
+        if self._opened and not self._path.exists():
+            return DeviceError(
+                "The session file was deleted or moved while it was recorded. Its data are lost if "
+                f"it was deleted. Keep other programs away from the folder. {self._path}"
+            )
         return DeviceError(
             f"The session file cannot be written ({_first_line(error)}). The data written so far "
             f"are kept. Free disk space, or choose another folder. {self._path}"

@@ -240,3 +240,23 @@ def test_a_study_whose_page_goes_says_so(bench: tuple[LiveBench, GuardedRig], cl
     gone = "The page that started the study has disconnected."
     assert live._study.why_not() == gone, "the first reason"
     live._mode, live._holder = "idle", ""
+
+
+@pytest.mark.parametrize(
+    "at_s", [10**400, "1000", None, True, [1000.0]], ids=["large", "text", "none", "true", "list"]
+)
+def test_a_time_that_is_no_number_is_old(
+    bench: tuple[LiveBench, GuardedRig], capsys: pytest.CaptureFixture[str], at_s: object
+) -> None:
+    """The command is refused like one that was delayed, without a traceback in the terminal."""
+    live, rig = bench
+    link = _Link.__new__(_Link)
+    link._bench = live
+    number = live.do("request", "page", {})["number"]
+    values = {"number": number, "limit_v": 1.0}
+    answer = link._answer({"id": 1, "do": "arm", "holder": "page", "values": values, "at_s": at_s})
+    assert answer["id"] == 1 and "error" in answer
+    assert capsys.readouterr().err == ""
+    assert not rig.safety.live
+    link._answer({"id": 2, "do": "arm", "holder": "page", "values": values, "at_s": 1000.0})
+    assert rig.safety.live, "the same with a number"

@@ -34,7 +34,7 @@ from dataclasses import asdict, replace
 from pathlib import Path
 
 from haselab.api.design import Actuator
-from haselab.base import HaselabError, InputError, JsonObject
+from haselab.base import HaselabError, InputError, JsonObject, is_real
 from haselab.panel.columns import LiveWriter
 from haselab.panel.files import PanelFiles
 from haselab.panel.live_bench import CARRIER_HZ, LiveBench
@@ -116,7 +116,7 @@ class _Link:
             at_s = command.get("at_s")
             answer = self._bench.do(
                 str(command.get("do")), str(command.get("holder")), values,
-                float(at_s) if isinstance(at_s, int | float) else -math.inf,
+                float(at_s) if is_real(at_s) else -math.inf,
             )  # fmt: skip
         except HaselabError as error:
             return {"id": number, "error": str(error)}

@@ -103,6 +103,8 @@ def _estimate(value: Estimate) -> str:
         return "not identifiable"
     low, high = value.ci95
     unit = f" {value.unit}" if value.unit else ""
+    if low == high:
+        return f"{value.value:.6g}{unit}"  # exact
     if math.isinf(value.std):
         return f"not identifiable from these data (the value {value.value:.6g}{unit} is arbitrary)"
     return f"{value.value:.6g}{unit}   95 % [{low:.6g}, {high:.6g}]"

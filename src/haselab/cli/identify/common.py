@@ -68,6 +68,10 @@ RATE = shared_option("--rate-hz", type=REAL, detail="Default: the rate in the fi
 INPUT = shared_option("--input", "source", default="u", show_default=True)
 OUTPUT = shared_option("--output", default="y", show_default=True)
 
+_SHORTER = {  # parts of an answer that nobody reads on the screen
+    "covariance": "of all parameters (use --json or --out)",
+    "training_output": "kept, so that haselab compare recognises these records",
+}
 _COPY = 0.9  # share of the samples of a record, above which it is a copy of another one
 
 STRETCH = Quantity("--stretch", ("stretch",), "1", "the stretch")
@@ -116,7 +120,9 @@ def emit_fit(
         if as_json:
             emit(fit.answer(), as_json=True, out=out)
         raise ResultError(f"{fit.status}: {listed}")
-    emit({**fit.answer(), **(more or {})}, as_json=as_json, out=out, shorter=shorter)
+    answer = {**fit.answer(), **(more or {})}
+    shown = {name: text for name, text in _SHORTER.items() if answer.get(name) is not None}
+    emit(answer, as_json=as_json, out=out, shorter={**shown, **(shorter or {})})
 
 
 @contextmanager

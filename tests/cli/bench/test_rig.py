@@ -211,8 +211,9 @@ def test_a_wrong_serial_number_stops_the_check_and_is_found_by_the_doctor(
 ) -> None:
     other = tmp_path / "other.toml"
     other.write_text(rig.read_text().replace("MY00000001", "MY00000002"))
-    code, _, err = call(capsys, "rig", "check", other)
+    code, out, err = call(capsys, "rig", "check", other)
     assert code == 2 and err.count("\n") == 1
+    assert out.splitlines()[-1].startswith("FAILED") and out.count("FAILED") == 1
     assert "generator has the serial number MY00000001" in err
     code, out, _ = call(capsys, "doctor", "--rig", other, "--json")
     found = {f["name"]: f for f in json.loads(out)["findings"] if f["kind"] == "instrument"}

@@ -267,3 +267,15 @@ def test_an_unstable_loop_is_called_unstable_instead_of_margins_that_are_no_numb
     assert code == 2
     assert "but with [model] of the same file the pid is unstable" in error
     assert "nan" not in error and "inf" not in error
+
+
+def test_a_highest_drive_in_another_unit_than_the_map_is_noticed(
+    leg: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """1.8 V typed in mV; the map gives 2.47 V at a strain of 0.2."""
+    changed(leg, ("high_v = 1.8\n", "high_v = 1800.0\n"))
+    said = "high_v in [drive] is 1800 V, but [drive.voltage_map] gives at most 2.47 V"
+    assert said in built(capsys, leg)[1]
+    assert said in run(capsys, "design", leg)[2]
+    changed(leg, ("high_v = 1800.0\n", "high_v = 18.0\n"))  # a drive that is larger than needed
+    assert "high_v in [drive]" not in built(capsys, leg)[1]

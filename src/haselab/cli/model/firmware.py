@@ -21,7 +21,7 @@ from haselab.control.reach import default_step
 from haselab.controllers import known_actuator
 from haselab.firmware import CURRENT_SHARE, ChipSettings, FrontEnd
 from haselab.models.plant import Plant
-from haselab.pipelines.design.stated_margins import controller_doubt, model_doubt
+from haselab.pipelines.design.stated_margins import controller_doubt, drive_doubt, model_doubt
 from haselab.rig.chip import (
     ChipDesign,
     ChipFile,
@@ -130,6 +130,8 @@ def build(
     for doubt in (model_doubt(run), controller_doubt(run, structure)):
         if doubt:
             raise InputError(doubt)
+    if doubt := drive_doubt(run):
+        click.echo(f"haselab: warning: {doubt}", err=True)
     file = None if rig is None else _chip_file(rig, board)
     front_end = load_board(board).front_end if file is None else file.front_end.front_end()
     module = ModuleLimits() if file is None else file.module

@@ -1,4 +1,4 @@
-"""Check what [controller] and [model] state against the rest of their file."""
+"""Check what [controller], [model] and [drive] state against the rest of their file."""
 
 from __future__ import annotations
 
@@ -6,6 +6,8 @@ import math
 import re
 from collections.abc import Mapping, Sequence
 from pathlib import Path
+
+import numpy as np
 
 from haselab.base import InputError
 from haselab.control import DesignSpec, margins
@@ -15,10 +17,11 @@ from haselab.pipelines.design.feedback import feedback_of
 from haselab.pipelines.design.model_file import loop_of, read_any_plant, read_origin, read_tables
 from haselab.store.actuator_file import ACTUATOR
 
-__all__ = ["controller_doubt", "delay_doubt", "model_doubt"]
+__all__ = ["controller_doubt", "delay_doubt", "drive_doubt", "model_doubt"]
 
 _SAME = 1e-6  # relative difference of a map's coefficients, and of delays
 _STABLE = "stable"
+_FAR = 100.0  # high_v over the voltages of the map: mV, or V behind the amplifier, typed as V
 _WORST = "worst_"  # prefix of a margin over the plants that the design covers
 # What is said of each margin, and its absolute and relative tolerance: above the rounding of
 # numbers typed by hand, below what matters to a loop.
@@ -159,6 +162,30 @@ def _said(text: str, value: float) -> str:
     if math.isfinite(value):
         return text.format(value)
     return re.sub(r"^a (.+?) (?:of|at) .*", r"no finite \1", text)
+
+
+def drive_doubt(path: Path) -> str:
+    """Why `high_v` of `[drive]` is not in the unit of the voltage map.
+
+    Args:
+        path: an actuator file, or the folder of a run.
+    Returns:
+        What is wrong and what to do; empty if both may be in the same unit, or if one is missing.
+    """
+    tables = read_tables(path)
+    high_v, table = tables.drive.high_v, tables.drive.voltage_map
+    if high_v is None or table is None:
+        return ""
+    ends = [table.strain_low, table.strain_high]
+    most_v = float(table.map().voltage_v(ends).max())
+    if not high_v > _FAR * most_v > 0.0:
+        return ""
+    file = path / ACTUATOR if path.is_dir() else path
+    return (
+        f"high_v in [drive] is {high_v:g} V, but [drive.voltage_map] gives at most {most_v:.3g} V "
+        f"from a strain of {ends[0]:g} to {ends[1]:g}. State high_v in V before the amplifier, as "
+        f"the map: {file}"
+    )
 
 
 def model_doubt(path: Path) -> str:

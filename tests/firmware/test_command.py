@@ -5,11 +5,13 @@ from __future__ import annotations
 import io
 import json
 import shutil
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
 import pytest
 
+from haselab.base import InputError
 from haselab.cli.main import main
 from haselab.control import step_metrics
 from haselab.firmware import ChipSettings, FrontEnd, settings_header
@@ -328,3 +330,73 @@ def test_a_current_channel_that_loses_the_carrier_is_refused(
     assert code == 2
     assert "codes in the current channel of the front end, but the chip needs 59" in error
     assert not (tmp_path / "settings.h").exists()
+
+
+@pytest.mark.parametrize(
+    ("arguments", "said"),
+    [
+        (("--step", 0, 0.5), "--step is 0 0.5, but the microcontroller accepts only strains of"),
+        (("--step", 0.02, 0.02), "--step is 0.02 0.02, which does not change the desired strain"),
+        (("--before-s", 0), "'--before-s': 0.0 is not in the range 0.1<=x<=600.0"),
+        (("--after-s", 0.01), "'--after-s': 0.01 is not in the range 0.1<=x<=600.0"),
+        (("--after-s", 1e12), "'--after-s': 1000000000000.0 is not in the range"),
+        (("--precondition", -1), "--precondition is -1 V, but it must be 0 to 2 V"),
+        (("--precondition", 3), "--precondition is 3 V, but it must be 0 to 2 V"),
+    ],
+)
+def test_an_option_out_of_its_range_is_named(
+    arguments: tuple[object, ...], said: str, capsys: pytest.CaptureFixture[str]
+) -> None:
+    code, _, error = run(capsys, "firmware", "simulate", DATA, *arguments)
+    assert code == 2
+    assert said in error and error.count("\n") == 1
+
+
+def test_limits_that_exclude_the_designed_step_are_named_with_the_step(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    path = tmp_path / "small.toml"
+    path.write_text(
+        SMALL.replace("high = 0.07", "high = 0.02") + "[controller.demands]\nstep = 0.04\n"
+    )
+    code, _, error = run(capsys, "firmware", "simulate", path)
+    assert code == 2
+    assert "--step is 0 0.04" in error and "strains of 0 to 0.02" in error
+
+
+@pytest.mark.parametrize(
+    ("old", "new", "said"),
+    [
+        ("low = 0.0, high = 0.07", "low = 0.01, high = 0.07", "they must contain zero strain"),
+        ("gain = 1.0", 'gain = 1.0\noutput_unit = "mm"', "The output of [model] is in mm"),
+        ("gain = 1.0", 'gain = 1.0\noutput_unit = "%"', "The output of [model] is in %"),
+        ("gain = 1.0", 'gain = 1.0\ninput_unit = "V"', "The input of [model] is in V"),
+        ("[1.49e-10, 2.84e-10]", "[1e-10, 2e-9]", "usable from 0 to 3.9 nF"),
+    ],
+)  # fmt: skip
+def test_a_firmware_that_cannot_run_is_not_built(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str], old: str, new: str, said: str
+) -> None:
+    path = tmp_path / "small.toml"
+    path.write_text(SMALL.replace(old, new))
+    code, _, error = run(capsys, "firmware", "build", path, "--build-dir", tmp_path / "fw")
+    assert code == 2
+    assert said in error and error.count("\n") == 1
+    assert not (tmp_path / "fw" / "firmware.hex").exists()
+
+
+def test_a_firmware_starts_at_zero_strain_just_outside_its_output() -> None:
+    """Zero strain is the length at 0 V, where the fitted map gives a slightly larger strain."""
+    settings = read_design(DATA, "pid", FrontEnd()).settings
+    near = replace(settings, strain_low=0.0008)
+    assert near.reference_limits == (0.0, near.strain_high)
+    assert settings_header(near).count(".reference_low = 0") == 1
+    assert settings.reference_limits == (settings.strain_low, settings.strain_high)
+
+
+def test_a_drive_that_does_not_reach_zero_strain_is_refused() -> None:
+    """The chip's loop starts at zero strain, but would stay below it."""
+    settings = read_design(DATA, "pid", FrontEnd()).settings
+    zero_v = float(VoltageMap(*settings.voltage_map).voltage_v(0.0))
+    with pytest.raises(InputError, match=rf"zero strain, which needs {zero_v:.4g} V"):
+        replace(settings, strain_high=-0.0003)

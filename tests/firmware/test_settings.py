@@ -139,7 +139,7 @@ def test_the_range_of_the_strain_map_is_compiled_in(actuator: Path) -> None:
     assert numbers_of(text_h, "capacitance_high_f") == [6.5e-10]
     assert settings_header(free) != text_h  # and so the checksums
     actuator.write_text(text.replace(map_, f"{map_}range_f = [9.0e-10, 9.5e-10]\n"))
-    with pytest.raises(InputError, match=r"usable from 8\.5e-10 to 1e-09 F, but the satur"):
+    with pytest.raises(InputError, match=r"usable from 0\.85 to 1 nF, but the satur"):
         _ = read_design(actuator, None, FrontEnd()).settings.capacitance_range_f
 
 

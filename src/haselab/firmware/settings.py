@@ -234,6 +234,16 @@ class ChipSettings:
                 "the voltage map again."
             )
 
+        beyond = self.strain_high < 0.0 if self.rises else self.strain_low > 0.0
+        if beyond:
+            raise InputError(
+                f"The highest drive, {max(self.table_v):.4g} V, gives a strain of "
+                f"{self.strain_high if self.rises else self.strain_low:.3g}, but a loop starts at "
+                f"zero strain, which needs {_core.voltage_from_strain(*self.voltage_map, 0.0):.4g} "
+                "V. Raise high_v in [drive] or drive_high_v of the rig, or widen the limits of "
+                "[controller]."
+            )
+
     def _check_front_end(self) -> None:
         """Refuse monitors and stages that saturate the converter, or that it cannot resolve."""
         front = self.front_end
@@ -281,6 +291,11 @@ class ChipSettings:
         return self.strain_low if self.rises else self.strain_high
 
     @property
+    def reference_limits(self) -> tuple[float, float]:
+        """Lowest and highest desired strain: those of the output, and 0, where a loop starts."""
+        return min(self.strain_low, 0.0), max(self.strain_high, 0.0)
+
+    @property
     def sensing(self) -> tuple[float, float, int, int, int]:
         """Fields of `hs_quadrature_config`: the turn, in 1/F, and range of squared amplitudes."""
         turn = 2.0 * math.pi * CARRIER_HZ / self.front_end.admittance_scale_s
@@ -310,7 +325,8 @@ class ChipSettings:
         middle = ((cubic * middle_f + curvature) * middle_f + slope) * middle_f + offset
         if not lowest <= middle <= highest:
             raise InputError(
-                f"The strain map is usable from {low_f:g} to {high_f:g} F, but the saturation is "
+                f"The strain map is usable from {1e9 * max(low_f, 0.0):.3g} to "
+                f"{1e9 * high_f:.3g} nF, but the saturation is "
                 f"{self.strain_low:g} to {self.strain_high:g}, far from the strain of {middle:.3g} "
                 "in its middle. Fit the map over a range that covers the saturation."
             )
@@ -447,8 +463,8 @@ def _body(s: ChipSettings) -> str:
             f"{{{_single(s.strain_low)}, {_single(steps)}, {_TABLE_STEPS}, voltage_table}}",
         ),
         ("in_volts", "1" if s.own is not None and s.own.in_volts else "0"),
-        ("reference_low", _single(s.strain_low)),
-        ("reference_high", _single(s.strain_high)),
+        ("reference_low", _single(s.reference_limits[0])),
+        ("reference_high", _single(s.reference_limits[1])),
         ("drive_high_v", _single(s.drive_high_v)),
         ("rise_v", _single(s.rise_v_per_s * period_s)),
         ("ramp_v", _single(s.ramp_v_per_s * period_s)),

@@ -91,7 +91,9 @@ def test_a_controller_of_an_earlier_model_is_refused_until_it_is_designed_again(
     code, error = built(capsys, leg)
     assert code == 2 and error.count("\n") == 1
     assert f"states a phase margin of {stated:.3g} deg" in error
-    assert f"the pid has a phase margin of {true['phase_margin_deg']:.3g} deg" in error
+    assert (
+        f"the pid is unstable, with a phase margin of {true['phase_margin_deg']:.3g} deg" in error
+    )
     assert f"haselab design {leg}" in error
     _, out, warning = run(capsys, "report", leg, "--json")
     assert warning == f"haselab: warning: {json.loads(out)['doubts']['controller']}\n"
@@ -205,7 +207,9 @@ def test_each_controller_of_the_file_has_its_own_margins(
     arguments = ("--controller", "pi", "--spec", spec, "--accept-shortfalls")
     assert run(capsys, "design", leg, *arguments)[0] == 0
     assert "none-such" in built(capsys, leg)[1]
-    assert "the pid has a phase margin" in built(capsys, leg, "--controller", "pid")[1]
+    assert (
+        "the pid is unstable, with a phase margin" in built(capsys, leg, "--controller", "pid")[1]
+    )
     doubt = json.loads(run(capsys, "report", leg, "--json")[1])["doubts"]["controller"]
     assert doubt.count("but with [model]") == 1
 
@@ -252,3 +256,26 @@ def test_a_run_with_such_a_file_warns_before_it_plays(
     assert delay.startswith("haselab: warning: The pid was designed for a loop delay of 0.0075 s")
     assert warning.startswith("haselab: warning: [controller] states a phase margin of")
     assert code == 2 and "is outside [0, 1.8] V" in refusal
+
+
+@pytest.mark.parametrize("gain", ["-1.1", "1e30"])
+def test_an_unstable_loop_is_called_unstable_instead_of_margins_that_are_no_numbers(
+    leg: Path, capsys: pytest.CaptureFixture[str], gain: str
+) -> None:
+    changed(leg, ("gain = 0.8\n", f"gain = {gain}\n"))
+    code, error = built(capsys, leg)
+    assert code == 2
+    assert "but with [model] of the same file the pid is unstable" in error
+    assert "nan" not in error and "inf" not in error
+
+
+def test_a_highest_drive_in_another_unit_than_the_map_is_noticed(
+    leg: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """1.8 V typed in mV; the map gives 2.47 V at a strain of 0.2."""
+    changed(leg, ("high_v = 1.8\n", "high_v = 1800.0\n"))
+    said = "high_v in [drive] is 1800 V, but [drive.voltage_map] gives at most 2.47 V"
+    assert said in built(capsys, leg)[1]
+    assert said in run(capsys, "design", leg)[2]
+    changed(leg, ("high_v = 1800.0\n", "high_v = 18.0\n"))  # a drive that is larger than needed
+    assert "high_v in [drive]" not in built(capsys, leg)[1]

@@ -51,7 +51,7 @@ from haselab.pipelines.design.sections import (
     limits_of,
     other_controllers,
 )
-from haselab.pipelines.design.stated_margins import model_doubt
+from haselab.pipelines.design.stated_margins import drive_doubt, model_doubt
 from haselab.store.folder import write_text
 from haselab.store.text_file import read_text
 
@@ -115,6 +115,8 @@ def command(
     warn_misspelled_in(model)
     if out is None and model.suffix.lower() == ".toml":
         load_actuator(model, to_write=True)
+    if model.suffix.lower() == ".toml" and (doubt := drive_doubt(model)):
+        click.echo(f"haselab: warning: {doubt}", err=True)
     if loop["structure"] not in ("pi", "pid"):
         kind = CONTROLLERS.find(loop["structure"])
         if kind.design is None:

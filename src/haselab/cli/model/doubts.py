@@ -7,7 +7,12 @@ from pathlib import Path
 import click
 
 from haselab.cli.actuator_file import warn_misspelled_in
-from haselab.pipelines.design.stated_margins import controller_doubt, delay_doubt, model_doubt
+from haselab.pipelines.design.stated_margins import (
+    controller_doubt,
+    delay_doubt,
+    drive_doubt,
+    model_doubt,
+)
 
 __all__ = ["warn_doubts"]
 
@@ -15,11 +20,15 @@ __all__ = ["warn_doubts"]
 def warn_doubts(path: Path, kind: str | None = None) -> None:
     """Warn of margins and a delay that are not those of the model, and of a model for another map.
 
+    Also warn of a highest drive that is not in the unit of the map.
+
     Args:
         path: an actuator file, or the folder of a run.
         kind: kind or name of the controller; None: that of `[controller]`.
     """
     warn_misspelled_in(path)
-    for doubt in (model_doubt(path), controller_doubt(path, kind), delay_doubt(path, kind)):
+    for doubt in (
+        drive_doubt(path), model_doubt(path), controller_doubt(path, kind), delay_doubt(path, kind)
+    ):  # fmt: skip
         if doubt:
             click.echo(f"haselab: warning: {doubt}", err=True)

@@ -11,7 +11,7 @@ import click
 
 from haselab.base import DeviceError, InputError, JsonObject, ResultError, table_at, to_plain
 from haselab.cli.actuator_file import warn_misspelled_in
-from haselab.cli.common import REAL, SEED, answer_options, emit
+from haselab.cli.common import REAL, SEED, Real, answer_options, emit
 from haselab.cli.model.doubts import warn_doubts
 from haselab.cli.options import shared_option
 from haselab.cli.output import OutputRule
@@ -21,7 +21,7 @@ from haselab.control.reach import default_step
 from haselab.controllers import known_actuator
 from haselab.firmware import CURRENT_SHARE, ChipSettings, FrontEnd
 from haselab.models.plant import Plant
-from haselab.pipelines.design.stated_margins import controller_doubt, model_doubt
+from haselab.pipelines.design.stated_margins import controller_doubt, drive_doubt, model_doubt
 from haselab.rig.chip import (
     ChipDesign,
     ChipFile,
@@ -63,6 +63,7 @@ _PREDICTED = (
     "rise_time_s", "raw_rise_time_s", "overshoot", "settling_time_s", "steady_state_error",
 )  # fmt: skip
 _HIGHEST_PAGE = "0003"  # of 64 kB, as Intel HEX writes it
+_DURATION = Real(0.1, 600.0)  # s; the microcontroller gets the desired strain every 0.1 s
 _structure = shared_option(
     "--controller", "--structure", "structure",
     detail="It is the kind or the name of a controller in the actuator file. Default: that of "
@@ -129,6 +130,8 @@ def build(
     for doubt in (model_doubt(run), controller_doubt(run, structure)):
         if doubt:
             raise InputError(doubt)
+    if doubt := drive_doubt(run):
+        click.echo(f"haselab: warning: {doubt}", err=True)
     file = None if rig is None else _chip_file(rig, board)
     front_end = load_board(board).front_end if file is None else file.front_end.front_end()
     module = ModuleLimits() if file is None else file.module
@@ -215,14 +218,14 @@ def _say_narrowed(settings: ChipSettings, designed: tuple[float, float], run: Pa
 )
 @click.option(
     "--before-s",
-    type=REAL,
+    type=_DURATION,
     default=10.0,
     show_default=True,
     help="Set the time before the step in s.",
 )
 @click.option(
     "--after-s",
-    type=REAL,
+    type=_DURATION,
     default=10.0,
     show_default=True,
     help="Set the time after the step in s.",
@@ -252,8 +255,11 @@ def simulate(
     1 kHz has the delay and the limits of the microcontroller. All three are first calibrated with a
     reference capacitor. If RUN is a folder, its report then shows the three loops. For a PI or PID,
     the simulated step of the microcontroller is compared with the step that [model] predicts. If
-    the difference is larger than `frequency_spread` and the band of the strain map explain, the
-    command names the cause and exits with code 3.
+    the difference at any time is larger than `frequency_spread`, the band of the strain map and
+    the error of the microcontroller's sensing explain, the command names the cause and exits with
+    code 3. It also exits with code 3 if the comparison says nothing, because the loop is unstable
+    for a natural frequency within `frequency_spread`, or because these errors are as large as the
+    step.
     """
     config = _twin(run, options["reading"], options["twin"], options["draw"])
     refuse_linked_folders(run, "firmware", "figures")
@@ -266,7 +272,9 @@ def simulate(
     settings, zero_m = design.settings, design.zero_length_m
     _say_narrowed(settings, design.limits, run)
     before, after = options["step"] or (0.0, _step_of(design))
+    _check_step(before, after, settings)
     precondition_v = options["precondition"]
+    _check_precondition(precondition_v, config)
     in_volts = settings.own is not None and settings.own.in_volts
     known = known_actuator(design.tables, run) if in_volts else None
     plan = StepPlan(
@@ -279,7 +287,7 @@ def simulate(
         check_stable(case)
     found = step_experiment(settings, config, options["seed"], plan)
     runs, chip = found.runs, found.chip
-    rows = [_row(loop, case, design.plant) for loop in runs]
+    rows = [_row(loop, case, design.plant, plan) for loop in runs]
     agreement = None if case is None else agreement_of(runs[-2], runs[-1], case)
     answer = {
         **_sizes(found.built),
@@ -316,6 +324,32 @@ def _step_of(design: ChipDesign) -> float:
     return default_step(design.plant, limits)
 
 
+def _check_step(before: float, after: float, settings: ChipSettings) -> None:
+    """Refuse a step that is none, or that the microcontroller does not accept."""
+    if before == after:
+        raise InputError(
+            f"--step is {before:g} {after:g}, which does not change the desired strain. Give two "
+            "different strains."
+        )
+    low, high = settings.reference_limits
+    if not (low <= before <= high and low <= after <= high):
+        raise InputError(
+            f"--step is {before:g} {after:g}, but the microcontroller accepts only strains of "
+            f"{low:.4g} to {high:.4g}, the limits of the controller and of [drive]. Give --step "
+            "BEFORE AFTER within them, or widen the limits."
+        )
+
+
+def _check_precondition(precondition_v: float, config: TwinConfig) -> None:
+    """Refuse a drive that the twin does not have."""
+    most_v = config.acquisition.drive_high_v
+    if not 0.0 <= precondition_v <= most_v:
+        raise InputError(
+            f"--precondition is {precondition_v:g} V, but it must be 0 to {most_v:g} V, the drive "
+            "of the twin before its amplifier."
+        )
+
+
 def _twin(
     run: Path, reading: Literal["rad", "hz"] | None, twin: Path | None, draw: int | None
 ) -> TwinConfig:
@@ -332,29 +366,53 @@ def _twin(
     return twin_of_reading(reading or "hz")
 
 
-def _row(loop: LoopRun, case: StepCase | None, plant: Plant) -> JsonObject:
+def _row(loop: LoopRun, case: StepCase | None, plant: Plant, plan: StepPlan) -> JsonObject:
     """Metrics of a loop's step, and those of its prediction."""
-    row = loop_row(loop, None if case is None else case.gains, plant)
+    row = _metrics(loop, loop.name, case, plant, plan)
     if case is not None:
-        expected = loop_row(predicted_loop(loop, case), None, plant)
+        expected = _metrics(predicted_loop(loop, case), "prediction", None, plant, plan)
         row["predicted"] = {name: expected[name] for name in _PREDICTED}
     return row
+
+
+def _metrics(
+    loop: LoopRun, name: str, case: StepCase | None, plant: Plant, plan: StepPlan
+) -> JsonObject:
+    try:
+        return loop_row(loop, None if case is None else case.gains, plant)
+    except InputError:
+        raise InputError(
+            f"After the step from {plan.before:g} to {plan.after:g}, the strain ({name}) does not "
+            f"move in the direction of the step within --after-s {plan.last_s:g}. Give a longer "
+            "--after-s, or a larger --step."
+        ) from None
 
 
 def _compared(found: Agreement | None) -> dict[str, Any]:
     """Status and comparison for the answer."""
     if found is None:
         return {"status": "not compared: only the step of a PI or PID is predicted"}
+    if found.says_nothing:
+        return {
+            "deviation": found.deviation,
+            "deviation_tolerated": None,
+            "deviation_at_s": found.at_s,
+            "comparison": f"The chip's step was not compared with the predicted one: "
+            f"{found.says_nothing}.",
+            "status": f"not compared: {found.says_nothing}",
+        }
     sentence = (
-        f"The chip's step deviates from the predicted one by up to {100.0 * found.deviation:.3g} % "
-        "of the step; frequency_spread and the band of the strain map cover "
-        f"{100.0 * found.covered:.3g} %."
+        f"{abs(found.at_s):.3g} s {'after' if found.at_s > 0.0 else 'before'} the step, the chip's "
+        f"strain differs from the predicted one by {100.0 * found.deviation:.3g} % of the step; "
+        "frequency_spread, the band of the strain map and the chip's sensing explain up to "
+        f"{100.0 * found.covered:.3g} % there."
     )
     if not found.agrees:
         sentence += f" Cause: {'; '.join(found.causes) or 'none of those that are checked'}."
     return {
         "deviation": found.deviation,
         "deviation_tolerated": found.covered,
+        "deviation_at_s": found.at_s,
         "comparison": sentence,
         "status": "ok" if found.agrees else "differs from the prediction",
     }

@@ -1,10 +1,13 @@
-"""Check what [controller] and [model] state against the rest of their file."""
+"""Check what [controller], [model] and [drive] state against the rest of their file."""
 
 from __future__ import annotations
 
 import math
+import re
 from collections.abc import Mapping, Sequence
 from pathlib import Path
+
+import numpy as np
 
 from haselab.base import InputError
 from haselab.control import DesignSpec, margins
@@ -14,9 +17,11 @@ from haselab.pipelines.design.feedback import feedback_of
 from haselab.pipelines.design.model_file import loop_of, read_any_plant, read_origin, read_tables
 from haselab.store.actuator_file import ACTUATOR
 
-__all__ = ["controller_doubt", "delay_doubt", "model_doubt"]
+__all__ = ["controller_doubt", "delay_doubt", "drive_doubt", "model_doubt"]
 
 _SAME = 1e-6  # relative difference of a map's coefficients, and of delays
+_STABLE = "stable"
+_FAR = 100.0  # high_v over the voltages of the map: mV, or V behind the amplifier, typed as V
 _WORST = "worst_"  # prefix of a margin over the plants that the design covers
 # What is said of each margin, and its absolute and relative tolerance: above the rounding of
 # numbers typed by hand, below what matters to a loop.
@@ -57,7 +62,7 @@ def controller_doubt(path: Path, kind: str | None = None) -> str:
         return ""
     return (
         f"[controller] states {_text(wrong, held.margins)}, but with [model] of the same file the "
-        f"{held.name or held.kind} has {_text(wrong, found)}. Design it again with: "
+        f"{held.name or held.kind} {_found(wrong, found)}. Design it again with: "
         f"{_design(held, file)}"
     )
 
@@ -92,7 +97,7 @@ def delay_doubt(path: Path, kind: str | None = None) -> str:
     margin = ["phase_margin_deg"]
     return (
         f"The {held.name or held.kind} was designed for a loop delay of {own_s:g} s, but [model] "
-        f"states loop_delay_s = {delay_s:g}, with which it has {_text(margin, found)} instead of "
+        f"states loop_delay_s = {delay_s:g}, with which it {_found(margin, found)} instead of "
         f"{_text(margin, designed)}. Correct loop_delay_s, or design it again with: "
         f"{_design(held, file)}"
     )
@@ -118,6 +123,7 @@ def _margins(held: ControllerSection, file: Path, loop: tuple[float, float]) -> 
     feedback, plant = feedback_of(held, rate_hz), read_any_plant(file)
     found = margins(plant, feedback, loop_delay_s=delay_s, rate_hz=rate_hz)
     known = {key: getattr(found, key) for key in _STATED if not key.startswith(_WORST)}
+    known[_STABLE] = float(found.stable)
     stated = [key for key in _STATED if key.startswith(_WORST) and key in held.margins]
     if not (stated and held.demands):
         return known
@@ -139,8 +145,47 @@ def _agree(key: str, stated: Mapping[str, float], found: Mapping[str, float]) ->
     )
 
 
+def _found(keys: Sequence[str], values: Mapping[str, float]) -> str:
+    """What the loop has; of an unstable loop, only the margins that are numbers."""
+    if values[_STABLE]:
+        return f"has {_text(keys, values)}"
+    finite = [key for key in keys if math.isfinite(values[key])]
+    return f"is unstable, with {_text(finite, values)}" if finite else "is unstable"
+
+
 def _text(keys: Sequence[str], values: Mapping[str, float]) -> str:
-    return " and ".join(_STATED[key][0].format(values[key]) for key in keys)
+    return " and ".join(_said(_STATED[key][0], values[key]) for key in keys)
+
+
+def _said(text: str, value: float) -> str:
+    """A margin in words: "a phase margin of 60 deg", or "no finite phase margin"."""
+    if math.isfinite(value):
+        return text.format(value)
+    return re.sub(r"^a (.+?) (?:of|at) .*", r"no finite \1", text)
+
+
+def drive_doubt(path: Path) -> str:
+    """Why `high_v` of `[drive]` is not in the unit of the voltage map.
+
+    Args:
+        path: an actuator file, or the folder of a run.
+    Returns:
+        What is wrong and what to do; empty if both may be in the same unit, or if one is missing.
+    """
+    tables = read_tables(path)
+    high_v, table = tables.drive.high_v, tables.drive.voltage_map
+    if high_v is None or table is None:
+        return ""
+    ends = [table.strain_low, table.strain_high]
+    most_v = float(table.map().voltage_v(ends).max())
+    if not high_v > _FAR * most_v > 0.0:
+        return ""
+    file = path / ACTUATOR if path.is_dir() else path
+    return (
+        f"high_v in [drive] is {high_v:g} V, but [drive.voltage_map] gives at most {most_v:.3g} V "
+        f"from a strain of {ends[0]:g} to {ends[1]:g}. State high_v in V before the amplifier, as "
+        f"the map: {file}"
+    )
 
 
 def model_doubt(path: Path) -> str:

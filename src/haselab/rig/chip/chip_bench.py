@@ -132,7 +132,7 @@ class ChipBench:
         )
         link.execute(SetTelemetry(0, 1))
         link.messages.clear()
-        self.strain_limits = Limits("desired strain", settings.strain_low, settings.strain_high, "")
+        self.strain_limits = Limits("desired strain", *settings.reference_limits, "")
         self._pass(2.0 / RATE_HZ)
 
     # ---- updates -----------------------------------------------------------------------------

@@ -151,6 +151,13 @@ def _settings(
             "[controller] has no limits of its output. Design it with haselab design, or add "
             "limits = {low = -0.05, high = 0.1}."
         )
+    if not allow_start((limits.low, limits.high)):
+        raise InputError(
+            f"The limits of [controller] are {limits.low:g} to {limits.high:g}, but they must "
+            "contain zero strain, where a loop starts. Widen the limits."
+        )
+    if step is None:
+        _check_units(tables)
     gains = _NO_GAINS if step is not None else _gains(controller)
     high_v = HIGHEST_DRIVE_V if high_v is None else min(HIGHEST_DRIVE_V, high_v)
     designed = (limits.low, limits.high)
@@ -170,6 +177,19 @@ def _settings(
     if step is not None and step.in_volts:
         settings = replace(settings, rise_v_per_s=rise_v_per_s)
     return settings, designed
+
+
+def _check_units(tables: ActuatorTables) -> None:
+    """Refuse gains for a model that is not from strain to strain, as the maps are."""
+    stated = {} if tables.model is None else tables.model.model_extra or {}
+    for key, end in (("input_unit", "input"), ("output_unit", "output")):
+        unit = stated.get(key)
+        if unit not in (None, "", "1"):
+            raise InputError(
+                f"The {end} of [model] is in {unit}, but the maps of this file are for a loop from "
+                "strain to strain. Identify the model again with the strain as output and with "
+                "--through-voltage-map, and design the controller again."
+            )
 
 
 def strains_within(

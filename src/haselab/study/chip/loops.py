@@ -309,7 +309,7 @@ def chip_loop(program: Path, elf: Path, config: TwinConfig, seed: int, plan: Ste
         status = [m for m in chip.messages if isinstance(m, Status)]
         stack = int(chip.counts["stack"])
         highest = max(out.code for out in chip.outputs)
-    held = round(plan.hold_s / _TICK_S)
+    held = round(plan.hold_s / _ALIVE_S) * round(_ALIVE_S / _TICK_S)
     time_s = np.asarray((np.arange(1, length_m.size + 1) - held) * _TICK_S, dtype=np.float64)
     reference = np.where(time_s <= 0.0, plan.before, plan.after)
     strain = np.asarray(length_m / plan.zero_length_m - 1.0, dtype=np.float64)

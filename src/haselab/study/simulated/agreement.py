@@ -2,10 +2,12 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Iterator
 from dataclasses import dataclass, replace
 
 import numpy as np
+from numpy.typing import NDArray
 
 from haselab.actuators import equilibrium_m, linearise
 from haselab.base import LimitError, ResultError
@@ -17,7 +19,9 @@ from haselab.control import (
     margins,
     simulate_loop,
 )
-from haselab.control.plants.general import AnyPlant
+from haselab.control.plants.general import AnyPlant, frequency_variants
+from haselab.firmware import CAPACITANCE_NOISE
+from haselab.models.actuator.strain_map import StrainMap
 from haselab.models.rational import RationalModel
 from haselab.rig.chip import ChipDesign
 from haselab.rig.twin.config import TwinConfig
@@ -25,11 +29,21 @@ from haselab.rig.twin.history import precondition
 from haselab.rig.twin.twin_bench import GRAVITY_M_S2, TwinBench
 from haselab.study.chip.loops import CHIP_DELAY_S, FAST, LoopRun, StepPlan, desktop_loop
 
-__all__ = ["Agreement", "StepCase", "agreement_of", "check_stable", "predicted_loop"]
+__all__ = [
+    "Agreement",
+    "StepCase",
+    "agreement_of",
+    "check_stable",
+    "predicted_loop",
+    "tolerance",
+]
 
 _FROM_S = -1.0  # of the step: from here on the responses are compared
 _SOFTENED = 0.01  # loss of stiffness that is a cause
 _MAP_POINTS = 65  # voltages at which the strain map is checked
+_CAPACITANCES = 10_001  # at which the ends of the step are searched
+_FREQUENCIES = 5  # from the lowest to the highest that the design covers
+_NOTHING = 1.0  # of the step: the deviation of a strain that does not move
 _LIMITING = 0.5  # of the deviation: what is left without the drive's rate limit if it is a cause
 
 
@@ -61,14 +75,70 @@ class StepCase:
     @property
     def map_band(self) -> float:
         """Stated error of the strain map, as a fraction of the step; 0 without a band."""
-        band = self.design.tables.strain_map().band or (0.0, 0.0)
-        return max(-band[0], band[1]) / abs(self.plan.after - self.plan.before)
+        band = self._strain_map.band or (0.0, 0.0)
+        return max(0.0, -band[0], band[1]) / abs(self.plan.after - self.plan.before)
+
+    @property
+    def sensing_error(self) -> float:
+        """Strain of one code of the chip's current channel, as a fraction of the step.
+
+        The simulated converter rounds each period in the same way, so the error does not average
+        out; it is at most about one code.
+        """
+        farad_per_code = 1.0 / self.design.settings.front_end.current_codes(1.0)
+        slope_per_f = max(abs(self._strain_map.slope_at(end_f)) for end_f in self._ends_f)
+        return farad_per_code * slope_per_f / abs(self.plan.after - self.plan.before)
+
+    @property
+    def noise_std(self) -> float:
+        """Standard deviation of the strain that one update of the chip measures."""
+        changes = [abs(end_f * self._strain_map.slope_at(end_f)) for end_f in self._ends_f]
+        return CAPACITANCE_NOISE * max(changes)
+
+    @property
+    def static_error(self) -> float:
+        """Error of a strain at rest by strain map and chip, as a fraction of the step.
+
+        They are independent, so their squares add up.
+        """
+        return math.hypot(self.map_band, self.sensing_error)
+
+    @property
+    def _strain_map(self) -> StrainMap:
+        return self.design.tables.strain_map()
+
+    @property
+    def _ends_f(self) -> tuple[float, ...]:
+        """Capacitances at both ends of the step, by the strain map."""
+        farad = np.linspace(*self.design.settings.capacitance_range_f, _CAPACITANCES)
+        strain = self._strain_map.strain(farad)
+        return tuple(
+            float(farad[np.abs(strain - end).argmin()])
+            for end in (self.plan.before, self.plan.after)
+        )
+
+    @property
+    def is_robust(self) -> bool:
+        """Whether the loop is stable with each natural frequency that the design covers."""
+        return all(
+            _stable(self, plant) for plant in frequency_variants(self.design.plant, self.spread)
+        )
+
+    def differences(self, one: LoopRun, other: LoopRun) -> NDArray[np.float64]:
+        """Difference of two responses at each time, as a fraction of the step.
+
+        Args:
+            one: response with `N` samples.
+            other: response at the same times.
+        Returns:
+            The absolute differences, without unit. Shape `(N,)`.
+        """
+        step = abs(self.plan.after - self.plan.before)
+        return np.asarray(np.abs(one.strain - other.strain) / step)
 
     def deviation(self, one: LoopRun, other: LoopRun) -> float:
         """Largest difference of two responses, as a fraction of the step."""
-        shown = one.time_s > _FROM_S
-        largest = float(np.abs(one.strain - other.strain)[shown].max())
-        return largest / abs(self.plan.after - self.plan.before)
+        return float(self.differences(one, other)[one.time_s > _FROM_S].max())
 
 
 @dataclass(frozen=True)
@@ -76,30 +146,36 @@ class Agreement:
     """How far a simulated step is from the predicted one.
 
     Args:
-        deviation: largest difference of the strains from 1 s before the step on, as a fraction of
-            the step.
-        covered: the same between the prediction and that for a plant whose natural frequency
-            differs by as much as the design covers, plus the band of the strain map.
+        deviation: difference of the strains at `at_s`, as a fraction of the step.
+        covered: difference that is tolerated at this time, as a fraction of the step.
+        at_s: time since the step at which the difference is largest relative to the tolerated one,
+            in s.
         causes: what differs between twin and model; only determined if the responses do.
+        says_nothing: why no difference would be a fault; empty if the comparison is meaningful.
     """
 
     deviation: float
     covered: float
+    at_s: float
     causes: tuple[str, ...] = ()
+    says_nothing: str = ""
 
     @property
     def agrees(self) -> bool:
         """Whether the step is one that the design covers."""
-        return self.deviation <= self.covered
+        return not self.says_nothing and self.deviation <= self.covered
 
 
-def predicted_loop(run: LoopRun, case: StepCase, factor: float = 1.0) -> LoopRun:
+def predicted_loop(
+    run: LoopRun, case: StepCase, factor: float = 1.0, *, noise: bool = False
+) -> LoopRun:
     """Predict a response with the identified plant, at the rate and delay of the loop.
 
     Args:
         run: the simulated response, from a drive of 0 V on.
         case: plant and controller.
         factor: on the natural frequency of the plant.
+        noise: add the noise of the chip's sensing to the measurements.
     Returns:
         The predicted response.
     """
@@ -107,7 +183,35 @@ def predicted_loop(run: LoopRun, case: StepCase, factor: float = 1.0) -> LoopRun
     plant = replace(plant, natural_frequency_rad_s=factor * plant.natural_frequency_rad_s)
     limits = Saturation(settings.strain_low, settings.strain_high)
     setting = LoopSetting(run.rate_hz, run.delay_s, limits, settings.strain_start, 1)
-    return replace(run, strain=simulate_loop(plant, case.gains, run.reference, setting).y)
+    white = None
+    if noise:
+        white = np.random.default_rng(case.seed).normal(0.0, case.noise_std, run.time_s.size)
+    trace = simulate_loop(plant, case.gains, run.reference, setting, measurement_noise=white)
+    return replace(run, strain=trace.y)
+
+
+def tolerance(run: LoopRun, case: StepCase) -> NDArray[np.float64]:
+    """Difference from the prediction that is no fault, at each time.
+
+    It is the sum of what a wrong natural frequency, within the spread of the design, changes from
+    this time on, of the error of a strain at rest (band of the strain map, sensing of the chip),
+    and of the chip's noise.
+
+    Args:
+        run: the simulated response with `N` samples.
+        case: plant and controller.
+    Returns:
+        The tolerated difference, as a fraction of the step. Shape `(N,)`.
+    """
+    expected = predicted_loop(run, case)
+    factors = np.linspace(1.0 - case.spread, 1.0 + case.spread, _FREQUENCIES)
+    moved = np.max(
+        [case.differences(predicted_loop(run, case, f), expected) for f in factors], axis=0
+    )
+    for part in (run.time_s <= 0.0, run.time_s > 0.0):  # a response passes through the other one
+        moved[part] = np.maximum.accumulate(moved[part][::-1])[::-1]
+    noise = case.deviation(predicted_loop(run, case, noise=True), expected)
+    return np.asarray(moved + case.static_error + noise)
 
 
 def agreement_of(desktop: LoopRun, chip: LoopRun, case: StepCase) -> Agreement:
@@ -120,15 +224,19 @@ def agreement_of(desktop: LoopRun, chip: LoopRun, case: StepCase) -> Agreement:
     Returns:
         The comparison, with causes if the responses differ.
     """
-    expected = predicted_loop(chip, case)
-    covered = max(
-        case.deviation(predicted_loop(chip, case, factor), expected)
-        for factor in (1.0 - case.spread, 1.0 + case.spread)
-    )
-    found = Agreement(case.deviation(chip, expected), covered + case.map_band)
+    shown = chip.time_s > _FROM_S
+    deviation = case.differences(chip, predicted_loop(chip, case))[shown]
+    covered = tolerance(chip, case)[shown]
+    worst = int(np.argmax(deviation / covered))
+    at_s = float(chip.time_s[shown][worst])
+    found = Agreement(float(deviation[worst]), float(covered[worst]), at_s)
+    if not case.is_robust:
+        return replace(found, says_nothing=_unstable_within_spread(case))
+    if found.agrees and covered.max() >= _NOTHING:
+        return replace(found, says_nothing=_too_tolerant(case, float(covered.max())))
     if found.agrees:
         return found
-    return replace(found, causes=tuple(_causes(desktop, chip, case, found.covered)))
+    return replace(found, causes=tuple(_causes(desktop, chip, case)))
 
 
 def check_stable(case: StepCase) -> None:
@@ -139,27 +247,46 @@ def check_stable(case: StepCase) -> None:
     Raises:
         ResultError: The loop is unstable.
     """
-
-    def stable(plant: AnyPlant) -> bool:
-        return margins(plant, case.gains, loop_delay_s=CHIP_DELAY_S, rate_hz=FAST.rate_hz).stable
-
-    if not stable(case.design.plant):
+    if not _stable(case, case.design.plant):
         raise ResultError(
             f"The loop of [model] and [controller] is unstable at the chip's {FAST.rate_hz:g} Hz "
             f"with a delay of {1e3 * CHIP_DELAY_S:.3g} ms. Design it again with --rate-hz and "
             f"--delay-s: {case.design.path}"
         )
-    if not stable(_linear(case, case.plan.before)):
+    if not _stable(case, _linear(case, case.plan.before)):
         raise ResultError(
             f"The loop is unstable on this twin: {_two_plants(case)}. Choose the twin of this "
             f"actuator with --twin or --reading: {case.design.path}"
         )
 
 
+def _stable(case: StepCase, plant: AnyPlant) -> bool:
+    """Whether the loop with a plant is stable at the chip's rate and delay."""
+    return margins(plant, case.gains, loop_delay_s=CHIP_DELAY_S, rate_hz=FAST.rate_hz).stable
+
+
+def _unstable_within_spread(case: StepCase) -> str:
+    return (
+        f"with a natural frequency that differs from [model] by {100.0 * case.spread:.3g} % "
+        "(frequency_spread), the loop is unstable, so any difference would be tolerated. Design "
+        "the controller again with haselab design"
+    )
+
+
+def _too_tolerant(case: StepCase, covered: float) -> str:
+    return (
+        f"a difference of {100.0 * covered:.3g} % of the step would be tolerated "
+        f"({100.0 * case.map_band:.3g} % for the band of the strain map, "
+        f"{100.0 * case.sensing_error:.3g} % for the sensing error, the rest for frequency_spread "
+        "and noise), so even a strain that does not move would agree. Use a larger --step, or fit "
+        "the strain map to a better record"
+    )
+
+
 # ---- causes --------------------------------------------------------------------------------------
 
 
-def _causes(desktop: LoopRun, chip: LoopRun, case: StepCase, covered: float) -> Iterator[str]:
+def _causes(desktop: LoopRun, chip: LoopRun, case: StepCase) -> Iterator[str]:
     """Yield each known difference between the chip on the twin and the prediction."""
     plant, plan = case.design.plant, case.plan
     ends = [_linear(case, strain) for strain in (plan.before, plan.after)]
@@ -188,7 +315,7 @@ def _causes(desktop: LoopRun, chip: LoopRun, case: StepCase, covered: float) -> 
             "[controller.demands]"
         )
     off = _map_error(chip, case)
-    if off > covered:
+    if off > case.static_error:
         yield f"the capacitance-to-strain map is off by {100.0 * off:.3g} % of the step on the twin"
 
 

@@ -144,7 +144,7 @@ def test_differences_along_an_axis_are_those_of_the_same_devices(campaigns: Any)
     rows = campaigns.rows_of(plan, result)
     rows[64 + 3].results["y"] = math.inf
     summary = summarised(plan, rows)
-    second, third = summary["along_axes"]
+    second, third = summary["axis_differences"]
     assert (second["axis"], second["value"], third["value"]) == ("case.noise_std", 0.02, 0.04)
     assert (second["count"], second["without_value"]) == (63, 1)
     low, high = second["median"]["ci95"]
@@ -152,7 +152,7 @@ def test_differences_along_an_axis_are_those_of_the_same_devices(campaigns: Any)
     assert third["least"] > 49.0
     page = campaign_page(summary, {})
     assert "Differences along case.noise_std" in page
-    assert "case.noise_std</th><td>0.01, 0.02, 0.04</td><td>each</td>" in page
+    assert "case.noise_std</th><td>0.01, 0.02, 0.04</td><td>axis</td>" in page
     assert "case.gain</th><td>0.4, 0.6</td><td>uniform</td>" in page and "duration_s = 1" in page
     ranks = page[page.index("Sensitivity: rank correlation") :]
     gain, frequency = (ranks.index(f"<td>case.{name}</td>")
@@ -160,7 +160,7 @@ def test_differences_along_an_axis_are_those_of_the_same_devices(campaigns: Any)
     assert gain < frequency, "the gain matters most"
     shared = campaigns.plan(text.replace("samples = 64", "samples = 64\nrepeats = 2"))
     shared_rows = campaigns.rows_of(shared, lambda noise_std, *_: noise_std)
-    (found,) = summarised(shared, shared_rows)["along_axes"]
+    (found,) = summarised(shared, shared_rows)["axis_differences"]
     assert found["median"] == {"value": pytest.approx(0.01), "ci95": None}
 
 
@@ -169,7 +169,7 @@ def test_differences_along_one_of_two_axes_keep_the_other(campaigns: Any) -> Non
     rows = campaigns.rows_of(plan, lambda gain, delay: gain + 1e4 * delay * gain)
     found = {
         (one["axis"], one["value"]): (one["least"], one["median"], one["largest"])
-        for one in summarised(plan, rows)["along_axes"]
+        for one in summarised(plan, rows)["axis_differences"]
     }
     assert found == {
         ("case.gain", 1.0): (-101.0, {"value": -51.0, "ci95": None}, -1.0),
@@ -183,19 +183,28 @@ def test_the_page_says_what_its_figures_leave_out(campaigns: Any) -> None:
     plan = campaigns.plan(GRID.replace("[0.0, 0.01]", str(delays)))
     rows = campaigns.rows_of(plan, lambda gain, delay: gain + delay)
     page = campaign_page(summarised(plan, rows), {f"y{k}": {} for k in range(13)})
-    assert "The first 6 of 9 values of case.delay_s." in page
-    assert "The first 12 of 13 results." in page
+    assert "the first 6 of 9 values of case.delay_s." in page
+    assert "the first 12 of 13 results." in page
     assert page.index("<table>") < page.index("<svg")
+
+
+def test_a_figure_over_each_of_three_axes_is_counted(campaigns: Any) -> None:
+    plan = campaigns.plan(GRID + "case.noise_std = [0.1, 0.2]\n")
+    rows = campaigns.rows_of(plan, lambda *values: sum(values))
+    for row in rows:
+        row.results.update({f"z{k}": float(k) for k in range(4)})
+    page = campaign_page(summarised(plan, rows), {})
+    assert page.count("<svg") == 12 and "Of 15 figures over axes, 12 are shown." in page
 
 
 def test_errors_that_differ_in_their_numbers_are_counted_together(campaigns: Any) -> None:
     plan = campaigns.plan(GRID)
     rows = campaigns.rows_of(plan, lambda gain, delay: gain)
-    for k, error in enumerate(["5.3e-2 is too far.", "1,200 is too far.", "No result."]):
+    for k, error in enumerate(["5.3e-2 is too far.", "-1,200 is too far.", "No S14."]):
         rows[k + 1] = replace(rows[k + 1], error=error, results={})
     found = summarised(plan, rows)["failures"]
     assert [(one["error"], one["count"], one["index"]) for one in found] == [
-        ("5.3e-2 is too far.", 2, 1), ("No result.", 1, 3),
+        ("5.3e-2 is too far.", 2, 1), ("No S14.", 1, 3),
     ]  # fmt: skip
 
 

@@ -149,10 +149,19 @@ def test_an_episode_depends_on_the_seed_alone() -> None:
     np.testing.assert_array_equal(play(1), first)
 
 
+def test_a_device_that_breaks_down_within_the_range_of_the_references_is_refused() -> None:
+    """Its reach would be that of a broken device."""
+    thin = find_device("hz").config.model_dump(exclude={"origin"})
+    thin["shell"]["thickness_m"] = 0.8e-3
+    devices = [find_device("hz"), TwinConfig(**thin)]
+    with pytest.raises(InputError, match=r"^Device 1 breaks down.* at a drive of 1\.7 V"):
+        StrainEnv("track", devices=devices)
+
+
 def test_a_breakdown_ends_the_episode_and_costs_100() -> None:
     weak = drawn(np.random.default_rng(3))
     data = weak.config.model_dump(exclude={"origin"})
-    data["dielectric"]["breakdown_v_per_m"] = 15e6
+    data["dielectric"]["breakdown_v_per_m"] = 30e6
     device = type(weak)(**{**weak.__dict__, "config": type(weak.config)(**data)})
     env = StrainEnv("track", devices=[device])
     env.reset(seed=1)

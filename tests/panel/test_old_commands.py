@@ -245,7 +245,7 @@ def test_a_study_whose_page_goes_says_so(bench: tuple[LiveBench, GuardedRig], cl
 @pytest.mark.parametrize(
     "at_s", [10**400, "1000", None, True, [1000.0]], ids=["large", "text", "none", "true", "list"]
 )
-def test_a_time_that_is_no_number_is_old(
+def test_a_command_without_a_valid_time_counts_as_old(
     bench: tuple[LiveBench, GuardedRig], capsys: pytest.CaptureFixture[str], at_s: object
 ) -> None:
     """The command is refused like one that was delayed, without a traceback in the terminal."""

@@ -41,7 +41,7 @@ _LEAST_BLOCKS = 64
 _SEED = 1  # of resampling: the same rows give the same intervals
 LEAST_CASES = 8
 _MOST_COMPARED = 8  # values of an axis
-_NUMBER = re.compile(r"\d[\d.,]*(e[-+]?\d+)?")
+_NUMBER = re.compile(r"(?<!\w)-?\d[\d.,]*(?:e[-+]?\d+)?", re.IGNORECASE)
 
 
 @dataclass(frozen=True)
@@ -151,7 +151,7 @@ def summarised(plan: Plan, rows: Sequence[CaseRow]) -> JsonObject:
         "sensitivities": list(_sensitivities(campaign, groups, names, independent=independent)),
         "unranked": [*_unranked(campaign)],
         "over_axes": _over_axes(campaign, groups, names),
-        "along_axes": [*_along_axes(campaign, rows, names)],
+        "axis_differences": [*_axis_differences(campaign, rows, names)],
         "failures": _failures(rows),
         "without_effect": [*_without_effect(campaign, rows)],
     }
@@ -165,7 +165,7 @@ def _over_axes(campaign: Campaign, groups: Sequence[Group], names: Sequence[str]
     return list(over_axes(campaign, groups[0].rows, values))
 
 
-def _along_axes(
+def _axis_differences(
     campaign: Campaign, rows: Sequence[CaseRow], names: Sequence[str]
 ) -> Iterator[JsonObject]:
     """Differences between the first and each other value of an axis, with all else the same.
@@ -180,11 +180,14 @@ def _along_axes(
     )  # fmt: skip
     each = campaign.points * campaign.design.repeats
     shape = (*(len(axis.values) for axis in campaign.axes), each)
+    columns = {
+        name: np.array([_number(row.results.get(name)) for row in rows]).reshape(shape)
+        for name in names
+    }
     for place, axis in enumerate(campaign.axes):
         if axis not in varied or len(axis.values) > _MOST_COMPARED:
             continue
-        for name in names:
-            values = np.array([_number(row.results.get(name)) for row in rows]).reshape(shape)
+        for name, values in columns.items():
             first, *others = np.moveaxis(values, place, 0)
             for value, other in zip(axis.values[1:], others, strict=True):
                 found = _differences(other.ravel(), first.ravel(), independent=independent)
@@ -280,6 +283,7 @@ def _coverage(group: Group, name: str, *, independent: bool) -> JsonObject | Non
     # infinity, of a positive parameter
     known = np.isfinite(true) & ~np.isnan(low) & ~np.isnan(high)
     known &= np.isfinite(low) | np.isfinite(high)
+    known &= low < high  # an exact number has no interval
     known &= ~np.isinf(group.values(f"{name}.std"))
     inside, count = int(((low <= true) & (true <= high))[known].sum()), int(known.sum())
     if count == 0:

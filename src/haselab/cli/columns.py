@@ -40,7 +40,7 @@ F = TypeVar("F", bound=Callable[..., Any])
 _LARGE_STRAIN = 1.0  # twice the length: without a unit, it is more likely per cent
 _FAR = 10.0  # times a known strain; per cent are 100 times
 _LENGTHS = 0.5, 3.0  # of actuators, over the length at strain 0
-_AT_ZERO = 0.3  # smallest displacement, over the length at strain 0
+_NEAREST_ZERO = 0.3  # smallest displacement, over the length at strain 0
 
 
 @dataclass(frozen=True)
@@ -73,7 +73,7 @@ class Quantity:
         return found or self.names[0]
 
 
-STRAIN = Quantity("--strain", ("strain",), "1", "the strain, or a displacement with --actuator")
+STRAIN = Quantity("--strain", ("strain",), "1", "the strain")
 
 
 def column_option(quantity: Quantity) -> Callable[[F], F]:
@@ -175,8 +175,8 @@ def check_strain(
     raise InputError(
         f"Column {column} reaches {size:.3g} and states no unit"
         f"{compared if place else f'; as a strain, {size:.3g} times the length'}. Add --unit "
-        f"'{column}=%' if it is in per cent, --unit '{column}=1' if it is a ratio, or name another "
-        f"column: {file}"
+        f"'{column}=%' if it is in per cent, --unit '{column}=1' if it is a ratio, --unit "
+        f"'{column}=mm' if it is a displacement or a length in mm, or name another column: {file}"
     )
 
 
@@ -210,22 +210,26 @@ def strains_of(
         raise InputError(
             f"Column {column} is in {unit.symbol}, but --strain needs the strain, or a displacement"
             " and the length at strain 0. State this length as zero_length_m in "
-            f"[actuator.geometry] of an actuator file, and name that with --actuator: {file}"
+            f"[actuator.geometry] of an actuator file, and add --actuator FILE: {file}"
         )
     least, largest = float(np.nanmin(values)), float(np.nanmax(values))
     if _LENGTHS[0] * zero_m < least and largest < _LENGTHS[1] * zero_m:
         what, strain = "length / zero_length_m - 1", values / zero_m - 1.0
-    elif float(np.nanmin(np.abs(values))) < _AT_ZERO * zero_m and max(-least, largest) < zero_m:
+    elif (
+        float(np.nanmin(np.abs(values))) < _NEAREST_ZERO * zero_m and max(-least, largest) < zero_m
+    ):
         what, strain = "displacement / zero_length_m", values / zero_m
     else:
         raise InputError(
             f"Column {column} is from {least:.4g} to {largest:.4g} m, but the length at strain 0 "
-            f"is zero_length_m = {zero_m:g} m, so it has neither displacements nor lengths. "
-            "Correct zero_length_m, or state the unit of the column with --unit: {file}"
+            f"is zero_length_m = {zero_m:g} m, so its values are neither displacements nor lengths."
+            f" Correct zero_length_m, or state the unit of the column with --unit: {file}"
         )
+    low, high = float(np.nanmin(strain)), float(np.nanmax(strain))
     click.echo(
-        f"haselab: strain = {what}, with {zero_m:g} m of the actuator file. {file}", err=True
-    )
+        f"haselab: strain = {what} ({low:.3g} to {high:.3g}), with zero_length_m = {zero_m:g} m of "
+        f"the actuator file. {file}", err=True,
+    )  # fmt: skip
     return np.asarray(strain)
 
 

@@ -321,6 +321,12 @@ def _reach(pool: _Pool) -> tuple[Floats, Floats]:
         held = pool.middle_v + share * pool.scale_v
         for _ in range(_REACH_UPDATES):
             ends.update(held, held, pool.load_n, farad, length_m)
+        if ends.any_fault:
+            first = next(k for k in range(count) if ends.fault(k))
+            raise InputError(
+                f"Device {first} breaks down, or leaves the lengths in which its law is valid, at "
+                f"a drive of {held[first]:.3g} V. Leave it out, or give a Device with a lower high_v."
+            )
         found.append(length_m / pool.zero_m - 1.0)
     return found[0], found[1]
 

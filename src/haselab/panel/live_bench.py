@@ -369,8 +369,8 @@ class LiveBench:
         strain, limits = number(values, "strain"), self._loop.saturation
         if not limits.low <= strain <= limits.high:
             raise LimitError(
-                f"The desired strain is {100.0 * strain:.4g} %, but the limits of the controller "
-                f"are {100.0 * limits.low:.4g} to {100.0 * limits.high:.4g} %. Choose another one."
+                f"The desired strain is {100.0 * strain:.6g} %, but the limits of the controller "
+                f"are {100.0 * limits.low:.6g} to {100.0 * limits.high:.6g} %. Choose another one."
             )
         if self._closed is None:
             highest_v = self._loop_v()

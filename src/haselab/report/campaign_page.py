@@ -25,6 +25,7 @@ _MOST_FIGURES = 12
 _MOST_CURVES = 6
 _MOST_CHANGES = 12
 _MOST_CHARACTERS = 160
+_MOST_LISTED = 12
 _MOST_RESULTS, _MOST_VALUES = 8, 50  # columns and rows of a table over an axis
 
 #: Results of the cases, by name and by group.
@@ -91,11 +92,11 @@ def _about(summary: Mapping[str, Any]) -> str:
 def _meaning(summary: Mapping[str, Any]) -> str:
     if not summary["is_random"]:
         return (
-            "All points of a grid, computed once each. The curves show which values the results "
-            "take on the grid; they are not probabilities, so quantiles have no intervals."
+            "All points of a grid, computed once each. Its shares of cases are not probabilities, "
+            "so quantiles have no intervals."
         )
     return (
-        "Share of cases at or below a value. Intervals are of 95 %, from order statistics; a dash "
+        "Intervals are of 95 %, from order statistics; a dash "
         "means that there are too few cases, or that cases share drawn values or noise. Intervals "
         "take the cases as independent draws; points of a Sobol or Latin hypercube design are "
         "spread more evenly, which makes the intervals too wide."
@@ -104,18 +105,20 @@ def _meaning(summary: Mapping[str, Any]) -> str:
 
 def _left_out(values: Values, over: Sequence[Mapping[str, Any]]) -> str:
     """Say what the figures do not show."""
-    parts = []
+    parts = ["Each figure of a result shows the share of cases at or below a value."]
     if len(values) > _MOST_FIGURES:
-        parts.append(f"The first {_MOST_FIGURES} of {len(values)} results.")
+        parts.append(f"The figures show the first {_MOST_FIGURES} of {len(values)} results.")
     most = max((len(groups) for groups in values.values()), default=0)
     if most > _MOST_CURVES:
-        parts.append(f"The first {_MOST_CURVES} of {most} points of the axes.")
+        parts.append(f"They show the first {_MOST_CURVES} of {most} points of the axes.")
     for path, levels in {
         one["axes"][1]: len({point["at"][1] for point in one["points"]})
         for one in over if len(one["axes"]) == 2
     }.items():  # fmt: skip
         if levels > _MOST_CURVES:
-            parts.append(f"The first {_MOST_CURVES} of {levels} values of {path}.")
+            parts.append(f"They show the first {_MOST_CURVES} of {levels} values of {path}.")
+    if (drawn := len(_drawn_over(over))) > _MOST_FIGURES:
+        parts.append(f"Of {drawn} figures over axes, {_MOST_FIGURES} are shown.")
     return " ".join(parts)
 
 
@@ -141,15 +144,15 @@ def _shares(values: Floats, label: str) -> Curve:
 
 def _tables(summary: Mapping[str, Any]) -> Iterator[_Table]:
     yield _Table(
-        "Parameters", f"What was varied. {_settings(summary)}",
+        "Parameters", f"Varied parameters. {_settings(summary)}",
         ("Parameter", "Values", "How"),
         [
-            (path, ", ".join(map(_shown, numbers)), shape)
+            (path, _listed(numbers), shape)
             for path, chosen in summary["parameters"].items()
             for shape, numbers in (
-                chosen.items() if isinstance(chosen, Mapping) else [("each", chosen)]
+                chosen.items() if isinstance(chosen, Mapping) else [("axis", chosen)]
             )
-        ],
+        ] or [(ABSENT, ABSENT, "repeats only")],
     )  # fmt: skip
     yield _Table(
         "Results", "Numbers in brackets are intervals of 95 %.",
@@ -176,7 +179,7 @@ def _tables(summary: Mapping[str, Any]) -> Iterator[_Table]:
         ],
     )  # fmt: skip
     yield from _over(summary["over_axes"])
-    yield from _along(summary["along_axes"])
+    yield from _along(summary["axis_differences"])
     yield from _sensitivities(summary["sensitivities"])
     yield _Table(
         "Failed cases",
@@ -226,7 +229,14 @@ def _settings(summary: Mapping[str, Any]) -> str:
         f"{name} = {_shown(value)}" for name, value in summary["settings"].items()
         if f"case.{name}" not in summary["parameters"]
     ]  # fmt: skip
-    return f"The other settings of [case]: {', '.join(fixed)}." if fixed else ""
+    return f"Other settings in [case]: {', '.join(fixed)}." if fixed else ""
+
+
+def _listed(values: Sequence[object]) -> str:
+    if len(values) > _MOST_LISTED:
+        ends = f"{_shown(values[0])}, {_shown(values[1])}, ..., {_shown(values[-1])}"
+        return f"{ends} ({len(values)} values)"
+    return ", ".join(map(_shown, values))
 
 
 def _over(found: Sequence[Mapping[str, Any]]) -> Iterator[_Table]:
@@ -305,16 +315,21 @@ def _spread(point: Mapping[str, Any], *, spread: bool = True) -> str:
     return f"{_text(point['median'])} ({_text(point['least'])} to {_text(point['largest'])})"
 
 
+def _drawn_over(found: Sequence[Mapping[str, Any]]) -> list[Mapping[str, Any]]:
+    """What has a figure: results over two axes, else over one; the first one has numbers."""
+    crossed = [one for one in found if len(one["axes"]) == 2]
+    return [
+        one for one in crossed or found
+        if all(type(point["at"][0]) in (int, float) for point in one["points"])
+    ]  # fmt: skip
+
+
 def _figures_over(found: Sequence[Mapping[str, Any]]) -> Iterator[str]:
     """Medians over a numeric axis; of two axes over the first, with one curve for each value.
 
     Only the first `_MOST_CURVES` values have a curve.
     """
-    crossed = [one for one in found if len(one["axes"]) == 2]
-    for number, one in enumerate((crossed or found)[:_MOST_FIGURES]):
-        first = [point["at"][0] for point in one["points"]]
-        if not all(type(value) in (int, float) for value in first):
-            continue
+    for number, one in enumerate(_drawn_over(found)[:_MOST_FIGURES]):
         curves = []
         for value in list(dict.fromkeys(tuple(point["at"][1:]) for point in one["points"])):
             points = [point for point in one["points"] if tuple(point["at"][1:]) == value]
@@ -344,7 +359,8 @@ def _sensitivities(found: Sequence[Mapping[str, Any]]) -> Iterator[_Table]:
     yield _Table(
         "Sensitivity: Sobol indices",
         "First-order index: share of the variance that a parameter causes alone. Total index: "
-        "together with all others; if it is the smaller of the two, this is the error of both. "
+        "together with all others. It cannot be smaller than the first-order index; where it "
+        "is, the estimates are too inaccurate. "
         "Intervals of 95 % from resampling. A block of samples in which "
         "a case has no finite value is left out; if many are, the indices are those of a part of "
         "the distributions only.",
@@ -370,10 +386,14 @@ def _sensitivities(found: Sequence[Mapping[str, Any]]) -> Iterator[_Table]:
 
 def _largest_first(found: Sequence[Mapping[str, Any]], key: str) -> list[Mapping[str, Any]]:
     """The parameters of each result and group, the most important first."""
-    places = {name: k for k, name in enumerate(dict.fromkeys(one["result"] for one in found))}
-    return sorted(
-        found, key=lambda one: (places[one["result"]], one["group"], -abs(one[key]["value"]))
-    )
+    pairs = dict.fromkeys((one["result"], one["group"]) for one in found)
+    places = {pair: place for place, pair in enumerate(pairs)}
+
+    def order(one: Mapping[str, Any]) -> tuple[int, float]:
+        size = abs(one[key]["value"])  # NaN for a parameter that does not vary
+        return places[one["result"], one["group"]], math.inf if math.isnan(size) else -size
+
+    return sorted(found, key=order)
 
 
 def _with_interval(number: Mapping[str, Any] | None) -> str:

@@ -78,11 +78,12 @@ def test_the_slope_is_that_of_the_strain(
         ("t;x", 1.0, STRAIN, ("--strain", "x", "--time", "u"), "--time u names no column of the"),
         ("t;x [mm]", 1.0, 60.0 * STRAIN, ("--strain", "x"), "State this length as zero_length_m"),
         ("t;x [mm]", 1.0, 60.0 * STRAIN + 25.0, ("--strain", "x", "--actuator", "A.toml"),
-         "neither displacements nor lengths"),
+         "its values are neither displacements nor lengths"),
+        ("t;x", 1.0, 60.0 * STRAIN, ("--strain", "x"), "'x=mm' if it is a displacement"),
         ("t;x [V]", 1.0, STRAIN, ("--strain", "x"), "is in V, but --strain needs the strain"),
     ],
 )  # fmt: skip
-def test_what_is_no_strain_is_refused_in_one_line(
+def test_a_column_that_is_not_a_strain_is_refused_in_one_line(
     capacitance: Path, capsys: pytest.CaptureFixture[str], header: str, time_scale: float,
     values: np.ndarray, options: tuple[str, ...], said: str,
 ) -> None:  # fmt: skip
@@ -90,6 +91,7 @@ def test_what_is_no_strain_is_refused_in_one_line(
     before = Path("A.toml").read_text()
     code, out, err = fitted(capsys, *options)
     assert code == 2 and out == "" and said in err.splitlines()[-1]
+    assert "S.csv" in err.splitlines()[-1] and "{" not in err
     assert Path("A.toml").read_text() == before
 
 

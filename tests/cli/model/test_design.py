@@ -206,7 +206,7 @@ def test_margins_of_a_derivative_without_its_filter_say_so(model, capsys):
     assert run(capsys, *words, "--derivative-filter-s", 0.02)[::2] == (0, "")
 
 
-def test_limits_that_nobody_stated_are_named_if_the_drive_reaches_further(model, tmp_path, capsys):
+def test_default_limits_are_reported_if_the_drive_reaches_further(model, tmp_path, capsys):
     """The map of eq. 4 of the paper reaches a strain of 0.069 at 1.6 V, and 0.133 at 2 V."""
     path = tmp_path / "A.toml"
     assert run(capsys, "design", model, "--out", path)[0] == 0
@@ -221,5 +221,5 @@ def test_limits_that_nobody_stated_are_named_if_the_drive_reaches_further(model,
         code, _, error = run(capsys, "design", path, "--json")
         assert code == 0 and ("No limits are stated" in error) == named
         if named:
-            assert "strains of -0.05 to 0.1; the voltage map reaches -0.04 to 0.133" in error
+            assert "strains of -0.05 to 0.1. The voltage map reaches -0.04 to 0.133" in error
             assert run(capsys, "design", path, "--json", "--limits", "-0.04", "0.05")[2] == ""

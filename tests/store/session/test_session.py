@@ -345,7 +345,7 @@ def test_a_write_that_hdf5_refuses_is_a_device_error(tmp_path, monkeypatch, meth
 def test_a_file_that_is_deleted_while_it_is_recorded_is_named(tmp_path):
     session = SessionWriter(tmp_path / "s.h5", PLANS, SAMPLES, HEADER)
     (tmp_path / "s.h5").unlink()
-    with pytest.raises(DeviceError, match=r"was deleted or moved while it was recorded.*s\.h5$"):
+    with pytest.raises(DeviceError, match=r"is no longer there: it was deleted.*s\.h5$"):
         for _ in range(2000):
             session.append_block("a", blocks_of(1)[0], 0.0, 0.0, 0.0)
             session.flush("a")

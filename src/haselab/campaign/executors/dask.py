@@ -6,6 +6,7 @@ worker that vanishes costs the cases in work and nothing else.
 
 from __future__ import annotations
 
+import contextlib
 import logging
 import multiprocessing
 import os
@@ -234,9 +235,11 @@ class DaskExecutor:
             if self._client.status == "running":
                 self._client.cancel(list(self._futures))
                 if self._limit_s is not None:
-                    self._client.run(
-                        _end_limited, self._problem, on_error="ignore", wait=False
-                    )  # a worker that hangs cannot hold the command up
+                    with contextlib.suppress(Exception):  # a worker that does not answer in time
+                        self._client.run(
+                            _end_limited, self._problem, on_error="ignore",
+                            callback_timeout=_GRACE_S,
+                        )  # fmt: skip
             self._client.close(timeout=_GRACE_S)
         except Exception:  # the scheduler is gone; what counts is in the folder
             pass

@@ -25,7 +25,9 @@ _GRID = 400
 class GeometrySettings(Section):
     """How a design is driven; mass and inertia are those of the twin."""
 
-    voltage_v: float = Field(8000.0, gt=0, le=1e6, description="in V, at the actuator")
+    voltage_v: float = Field(
+        8000.0, gt=0, le=1e6, description="highest voltage at the actuator, in V"
+    )
     bias_share: float = Field(
         0.7, gt=0, lt=1, description="of that voltage, about which the bandwidth is computed"
     )

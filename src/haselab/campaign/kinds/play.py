@@ -47,7 +47,8 @@ class PlaySettings(Section):
         (), description="ids, all if there are none", examples=[["S20.omega_n"]]
     )
     noise_free: bool = Field(
-        False, description="play the study without noise, too; its results count as true"
+        False,
+        description="also play the study without noise; its results count as the true values",
     )
 
 

@@ -144,7 +144,7 @@ def _shorter(fit: ActuatorFit) -> JsonObject:
         },
         "linear_models": {
             f"{point.voltage_v:g} V, {fit.mass_kg:g} kg": f"{point.gain_m_per_v:.4g} m/V, poles "
-            f"{_modes(point.poles)} 1/s"
+            f"{_modes(point.poles)} rad/s"
             for point in fit.linear_models
         },
         "rejected_laws": [

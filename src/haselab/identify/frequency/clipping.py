@@ -19,8 +19,8 @@ _BETTER = 50.0  # twice the gain of logarithmic likelihood that identifies a lim
 _FOLLOWS = 0.3  # slope of the outputs beyond a limit over the prediction; 0 where they are clipped
 _EXTREME = 0.999  # of the outputs lie below the limit plus ...
 _CLEAR = 4.0  # ... this many standard deviations of the noise
-_CONSTANT = 2.0  # largest median deviation from a limit over the white noise, or ...
-_FLAT = 0.1  # ... over the deviation of the prediction there
+_CONSTANT = 1.5  # largest median deviation from a limit over that of the prediction elsewhere, or
+_FLAT = 0.1  # over the standard deviation of the prediction beyond the limit
 _EXPLAINED = 0.1  # largest share of the outputs' energy in the residuals
 _LEAST_ROWS = 10
 _LEAST_VISITS = 2
@@ -68,12 +68,6 @@ def _predicted(
     return np.asarray(np.fft.irfft(spectrum, u.size))
 
 
-def _white(y: Floats, rows: NDArray[np.bool_]) -> float:
-    """Standard deviation of the white noise in runs of rows, from second differences."""
-    second = np.diff(y, 2)[rows[2:] & rows[1:-1] & rows[:-2]]
-    return float(np.sqrt(np.mean(second**2) / 6.0)) if second.size else 0.0
-
-
 def _rail(y: Floats, predicted: Floats) -> float | None:
     """The clearest upper limit."""
     best: tuple[float, float] | None = None
@@ -91,7 +85,8 @@ def _rail(y: Floats, predicted: Floats) -> float | None:
             continue
         if extreme - rail > _CLEAR * float(there.std()):
             continue  # an extreme value that is reached often, not a limit
-        steady = max(_CONSTANT * _white(y, beyond), _FLAT * float(modelled.std()))
+        elsewhere = float(np.median(np.abs(y[~beyond] - predicted[~beyond])))
+        steady = max(_CONSTANT * elsewhere, _FLAT * float(modelled.std()))
         if float(np.median(np.abs(there - rail))) > steady:
             continue  # a curve, such as the trough of a response to the square of a voltage
         off = float(((there - modelled) ** 2).sum())

@@ -39,7 +39,7 @@ CONTROLLER_KEYS = (
     "kind", "name", "parameters", "limits", "loop", "margins", "demands", "predicted", "plausible",
     "uncertainty", "alternatives",
 )  # fmt: skip
-_CLOSE = 1e-3  # strain
+_STRAIN_TOLERANCE = 1e-3
 _DEFAULT = (Saturation().low, Saturation().high)  # strain, the study's
 _NO_UNCERTAINTY = "no uncertainty: [model] has no covariance"
 
@@ -154,12 +154,12 @@ def default_limits_note(path: Path, given: tuple[float, float] | None, used: Sat
     to_volt = known.voltage_map()
     map_ends = (min(to_volt.strain_low, 0.0), max(to_volt.strain_high, 0.0))
     reach = reachable_range(Saturation(*map_ends), to_volt, *known.drive_ends_v())
-    if reach.low > used.low - _CLOSE and reach.high < used.high + _CLOSE:
+    if reach.low > used.low - _STRAIN_TOLERANCE and reach.high < used.high + _STRAIN_TOLERANCE:
         return ""
     return (
-        f"No limits are stated, so set-points are limited to strains of {used.low:.3g} to "
-        f"{used.high:.3g}; the voltage map reaches {reach.low:.3g} to {reach.high:.3g}. State them "
-        f"with --limits LOW HIGH. {path}"
+        f"No limits are stated, so the controller's output is limited to strains of {used.low:.3g} "
+        f"to {used.high:.3g}. The voltage map reaches {reach.low:.3g} to {reach.high:.3g} within "
+        f"[drive]. To use more of it, add --limits LOW HIGH. {path}"
     )
 
 

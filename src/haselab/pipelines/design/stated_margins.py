@@ -7,8 +7,6 @@ import re
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 
-import numpy as np
-
 from haselab.base import InputError
 from haselab.control import DesignSpec, margins
 from haselab.control.plants.general import frequency_variants

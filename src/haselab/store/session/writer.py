@@ -192,15 +192,24 @@ class SessionWriter:
     def _failed(self, error: BaseException) -> DeviceError:
         if isinstance(error, DeviceError):
             return error
-        if self._opened and not self._path.exists():
+        if self._opened and self._is_gone():
             return DeviceError(
-                "The session file was deleted or moved while it was recorded. Its data are lost if "
-                f"it was deleted. Keep other programs away from the folder. {self._path}"
+                "The session file is no longer there: it was deleted or moved, or its disk was "
+                f"removed. A deleted file cannot be recovered. {self._path}"
             )
         return DeviceError(
             f"The session file cannot be written ({_first_line(error)}). The data written so far "
             f"are kept. Free disk space, or choose another folder. {self._path}"
         )
+
+    def _is_gone(self) -> bool:
+        try:
+            self._path.stat()
+        except FileNotFoundError:
+            return True
+        except OSError:
+            return False
+        return False
 
     def _behind(self) -> DeviceError:
         rule = self._queue

@@ -64,13 +64,15 @@ class ControllerDesign(Experiment[Control]):
     def _unplayed(self, key: str) -> str:
         """Say that a loop of S21 was computed and not played; empty if it was played."""
         trials = self.study.steps
-        if not key.startswith("S21.") or key.startswith("S21.plant_"):
+        if not key.startswith("S21.") or key.startswith(("S21.plant_", "S21.printed_")):
+            return ""
+        if key == "S21.delay":  # of every loop
             return ""
         delayed = key.startswith("S21.delayed_")
         if trials.extra_delay_trials if delayed else trials.pi_trials:
             return ""
         name = "extra_delay_trials" if delayed else "pi_trials"
-        return f"computed for the PI of [control] and not played ({name} = 0)"
+        return f"not played (steps.{name} = 0); computed for the scaled PI"
 
     def rows(self) -> Mapping[str, Quantity]:
         """See `Experiment`."""

@@ -22,6 +22,7 @@ from numpy.typing import NDArray
 from haselab.actuators import ActuatorLaw
 from haselab.base import InputError
 from haselab.identify.physical.misfit import CAPACITANCE, LENGTH, TRACKED_ZERO_M, Misfit
+from haselab.identify.physical.misstated import WrongScale, find_wrong_scale, suspect_scale
 from haselab.identify.physical.plausible import find_implausible, motion_before_drive
 from haselab.identify.physical.record import MotionRecord
 from haselab.identify.physical.residuals import (
@@ -39,7 +40,6 @@ from haselab.identify.physical.rivals import (
 )
 from haselab.identify.physical.search import SearchResult, refine, search
 from haselab.identify.physical.unknowns import CAMERA_OFFSET, CAMERA_SCALE, Unknowns
-from haselab.identify.physical.wrong_scale import WrongScale, find_wrong_scale
 
 __all__ = ["fit_actuator"]
 
@@ -215,15 +215,16 @@ def _with_effects(
         again = refine(misfit, better.start, found.evaluations)
         if again is not None and again.converged and not _explains(misfit, found, again):
             break
+        # before another search, which takes long
+        if scaled := find_wrong_scale(misfit, found, again, (better.effect,)):
+            return misfit, found, rejected, scaled
         again = _from_start(misfit, better.start.at(start), again, explained=True)
         if again is None or not _explains(misfit, found, again):
             break
-        if scaled := find_wrong_scale(misfit, found, again, (better.effect,)):
-            return misfit, found, rejected, scaled
         misfit, found = _weighed(misfit, again.unknowns, again)
         rejected.append(Rival(f"without {better.effect}", -better.log_evidence))
-    explained = channel_residuals(misfit, found).explained
-    return misfit, found, rejected, None if explained else find_wrong_scale(misfit, found)
+    suspect = not channel_residuals(misfit, found).explained or suspect_scale(misfit, found)
+    return misfit, found, rejected, find_wrong_scale(misfit, found) if suspect else None
 
 
 def _scale_instead(

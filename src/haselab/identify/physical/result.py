@@ -29,7 +29,7 @@ from haselab.identify.physical.information import (
     vague_information,
 )
 from haselab.identify.physical.misfit import CAPACITANCE, LENGTH, Misfit, Segment
-from haselab.identify.physical.misstated import misstated_std, scale_error
+from haselab.identify.physical.misstated import WrongScale, misstated_std, scale_error
 from haselab.identify.physical.model_error import hidden_std, widen_std
 from haselab.identify.physical.record import MotionRecord
 from haselab.identify.physical.residuals import (
@@ -49,7 +49,6 @@ from haselab.identify.physical.unknowns import (
     Unknowns,
     shares_of,
 )
-from haselab.identify.physical.wrong_scale import WrongScale
 
 __all__ = ["ActuatorFit", "result_of"]
 

@@ -6,6 +6,7 @@ import pytest
 from haselab.identify import Record, TransferStructure, fit_transfer
 from haselab.identify.training_output import TrainingOutput, hash_output, is_comparable, share_used
 from haselab.models import Plant
+from haselab.models.actuator.model_tables import TrainingOutputTable
 
 
 def output(size, seed=1):
@@ -193,3 +194,9 @@ def test_compare_in_python_knows_half_of_the_record():
     assert str(fit.compare(second)).startswith("Prediction: ok\nfit_percent ")
     wrong = Record(-second.u, 100.0, second.y, time_s, None)
     assert fit.compare(wrong).status.startswith("the prediction is worse than the mean")
+
+
+def test_hashes_of_cells_without_width_are_refused():
+    with pytest.raises(ValueError, match=r"cell is 0, but hashes need cells above 0"):
+        TrainingOutputTable(cell=0.0, hashes=[1])
+    assert TrainingOutputTable(cell=0.0, hashes=[]).cell == 0.0  # of a constant output

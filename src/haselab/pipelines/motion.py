@@ -29,6 +29,8 @@ Floats = NDArray[np.float64]
 _SAME_S = 1e-7  # times closer than that are one
 _LARGE = 300.0  # step in codes, from which its own delay is known to less than a microsecond
 _EMPTY = 0.05  # inertia of an empty clamp, of the largest hung mass
+_LEAST_KNOWN = 20  # capacitances, from which their law is fitted
+_LEAST_RANGE = 1e-3  # of the length, over which they change visibly
 _RATIO_STD = 1e-3  # largest standard deviation of the ratio of measured and stated voltage
 
 
@@ -216,9 +218,12 @@ def _blocks(
     used = sensed.valid & plain & np.isfinite(sensed.capacitance_f) & (sensed.capacitance_std_f > 0)
     volt_per_code = rig["volt_per_code"] / rig["v_monitor_v_per_v"]
     carrier_v = 0.5 * volt_per_code * float(np.median(sensed.v_pp[used])) if used.any() else np.nan
+    farad = _charged_f(record, float(rig["scale_m_per_px"]), sensed, lockin.middle_s,
+                       rig["switch_sample"] / config.rate_hz)  # fmt: skip
+    ohm = max(float(np.median(sensed.resistance_ohm[used])), 0.0) if used.any() else 0.0
     return _Blocks(
         record.block_start_s, record.drive_v, _spans(lockin) / config.rate_hz,
-        sensed.capacitance_f, sensed.capacitance_std_f, used, carrier_v, rise, _lag_s(sensed, used),
+        sensed.capacitance_f, sensed.capacitance_std_f, used, carrier_v, rise, ohm * farad,
         *_weights(record.codes[:, :, 0], lockin),
     )  # fmt: skip
 
@@ -420,12 +425,43 @@ def _rise(codes: NDArray[np.int16], lockin: Lockin) -> _Rise:
     )  # fmt: skip
 
 
-def _lag_s(sensed: Sensed, used: NDArray[np.bool_]) -> Floats:
-    """Resistance times capacitance of each block; of unused blocks, the median of the others."""
-    if not used.any():
-        return np.zeros(used.size)
-    capacitance_f = np.where(used, sensed.capacitance_f, np.median(sensed.capacitance_f[used]))
-    return max(float(np.median(sensed.resistance_ohm[used])), 0.0) * capacitance_f
+def _charged_f(
+    record: ExperimentRecord,
+    scale_m_per_px: float,
+    sensed: Sensed,
+    middle_s: float,
+    switch_s: float,
+) -> Floats:
+    """Capacitance of each block at its switch, by its length there.
+
+    In a fast motion, few blocks have a capacitance, and it changes much from one to the next.
+
+    Args:
+        record: with the blocks, and the frames if there are any.
+        scale_m_per_px: of the frames.
+        sensed: capacitances.
+        middle_s: time for which these stand, from the beginning of a block.
+        switch_s: time of the switch, likewise.
+    """
+    known = sensed.valid & np.isfinite(sensed.capacitance_f) & (sensed.capacitance_f > 0.0)
+    if not known.any():
+        return np.zeros(known.size)
+    farad = np.where(known, sensed.capacitance_f, np.median(sensed.capacitance_f[known]))
+    time_s, length_m, _, _ = _lengths([record], scale_m_per_px)
+    if length_m.size < 2 or np.count_nonzero(known) < _LEAST_KNOWN:
+        return farad
+    at_switch, at_middle = (
+        np.interp(record.block_start_s + at_s, time_s, length_m) for at_s in (switch_s, middle_s)
+    )
+    low_m, high_m = at_middle[known].min(), at_middle[known].max()
+    size_m = max(high_m - low_m, _LEAST_RANGE * high_m)
+
+    def powers(lengths_m: Floats) -> Floats:
+        return np.vander((np.clip(lengths_m, low_m, high_m) - low_m) / size_m, 3)
+
+    by_length = np.linalg.lstsq(powers(at_middle[known]), np.log(farad[known]), rcond=1e-6)[0]
+    now, later = np.exp(powers(at_switch) @ by_length), np.exp(powers(at_middle) @ by_length)
+    return np.where(known, farad * now / later, now)
 
 
 def _without_carrier(codes: NDArray[np.int16], carrier: Floats) -> tuple[Floats, Floats]:

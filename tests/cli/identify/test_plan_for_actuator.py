@@ -68,6 +68,30 @@ def test_the_shortest_study_is_written_and_can_be_read(tmp_path):
     assert page.startswith(f"{GOAL}: ") and "relative standard deviation 4 to " in page
 
 
+@pytest.mark.long
+@pytest.mark.parametrize(("seen_mm", "further"), [((66.0, 66.5), True), ((20.0, 200.0), False)])
+def test_a_study_that_moves_the_actuator_further_than_the_records_says_so(
+    tmp_path, seen_mm, further
+):
+    lengths = [1e-3 * length for length in seen_mm]
+    path = file_of(tmp_path)
+    text = path.read_text()
+    path.write_text(text.replace("[model.physical.records]\n",
+                                 f"[model.physical.records]\nlengths_m = {lengths}\n"))  # fmt: skip
+    notes = json.loads(run(path, "--goal", GOAL, "--json").stdout)["notes"]
+    found = [note for note in notes if "further than the records" in note]
+    assert len(found) == further
+    if further:
+        assert "(66 to 66.5 mm)" in found[0]
+
+
+def test_a_covariance_of_zeros_is_refused_like_by_compare(tmp_path):
+    zeros = np.zeros((len(UNKNOWNS.names), len(UNKNOWNS.names))).tolist()
+    path = file_of(tmp_path, covariance={"names": list(UNKNOWNS.names), "matrix": zeros})
+    with pytest.raises(InputError, match=r"the matrix has a variance of 0, so it is not a"):
+        run(path, "--goal", GOAL)
+
+
 def test_an_unknown_parameter_is_refused(tmp_path):
     with pytest.raises(InputError, match=r"--goal is shell.length, but must be a parameter"):
         run(file_of(tmp_path), "--goal", "shell.length")

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from haselab.actuators import PlanarHasel, SampledLaw, with_parameters
-from haselab.base import InputError, ResultError
+from haselab.base import InputError
 from haselab.identify.physical import fit_actuator
 from haselab.identify.physical.information import RELATIVE, covariance_of, vague_information
 from haselab.identify.physical.misfit import Misfit
@@ -154,7 +154,7 @@ def test_a_planned_drop_lasts_as_long_as_it_is_played():
 def test_a_covariance_that_is_none_is_refused():
     unknowns = Unknowns.of(TRUE, added_inertia_kg=0.0, mass_kg=MASS_KG)
     size = unknowns.values.size
-    with pytest.raises(ResultError, match=r"not finite and positive"):
+    with pytest.raises(InputError, match=r"not finite and positive"):
         Outlook.of(unknowns, np.full((size, size), np.inf))
-    with pytest.raises(ResultError, match=r"negative eigenvalue"):
+    with pytest.raises(InputError, match=r"negative eigenvalue"):
         Outlook.of(unknowns, np.eye(size) + np.full((size, size), -0.5) + 0.5 * np.eye(size))

@@ -8,11 +8,12 @@ import numpy as np
 import pytest
 
 from haselab.actuators import GRAVITY_M_S2, Drive, SampledLaw
-from haselab.pipelines.motion import _drive, _late_s, _rise, _weights
+from haselab.pipelines.motion import _charged_f, _drive, _late_s, _rise, _weights
 from haselab.rig.twin.config import Mullins, TwinConfig
 from haselab.rig.twin.twin_bench import native_bench
 from haselab.rig.twin.twin_file import load_twin
 from haselab.sensing import Lockin, LockinConfig
+from haselab.store.session.writer import SessionWriter
 
 KINDS = Path(__file__).resolve().parents[3] / "examples" / "kinds"
 
@@ -137,3 +138,38 @@ def test_the_drive_of_a_record_moves_the_law_as_the_instruments_moved_the_actuat
     # a delay of 10 us is seen
     late = replace(drive, edge_s=drive.edge_s + 1e-5 * (drive.edge_s > 0.0))
     assert left_m(late) > bound * motion_m
+
+
+def test_in_fast_motion_the_lag_follows_the_capacitance_at_each_switch():
+    """A swing of 10 Hz by a third of the length, where one block in ten has a capacitance."""
+    block_s, middle_s, switch_s, scale = 0.01, 6e-3, 2e-3, 1e-4
+    count = 300
+    start_s = block_s * np.arange(count)
+
+    def length_m(time_s):
+        return 0.036 * (1.0 + 0.3 * np.sin(2.0 * np.pi * 9.7 * time_s))
+
+    def farad(time_s):  # of a stack: its volume and the number of its layers are constant
+        return 1e-9 * (0.036 / length_m(time_s)) ** 2
+
+    frame_s = np.arange(0.0, count * block_s + 0.005, 0.005)
+    tracks = np.zeros((frame_s.size, 6), SessionWriter.track_dtype())
+    tracks["valid"], tracks["std_y_px"] = True, 0.02
+    tracks["y_px"][:, 3:] = (length_m(frame_s) / scale)[:, None]
+    sensed = SimpleNamespace(
+        valid=np.arange(count) % 10 == 0, capacitance_f=np.where(
+            np.arange(count) % 10 == 0, farad(start_s + middle_s), np.nan)
+    )  # fmt: skip
+    record = SimpleNamespace(block_start_s=start_s, frame_time_s=frame_s, tracks=tracks)
+    found = _charged_f(record, scale, sensed, middle_s, switch_s)
+    true = farad(start_s + switch_s)
+    # a parabola of the logarithm of a square, over 0.7 to 1.3 of the length: third order
+    cubic = 2.0 / 3.0 * 0.3**3
+    between = 0.3 * 0.5 * (2.0 * np.pi * 9.7 * 0.0025) ** 2  # frames, linearly interpolated
+    limit = cubic / 4.0 + 2.0 * between / 0.7
+    assert np.abs(found / true - 1.0).max() < limit
+    assert np.abs(np.median(true) / true - 1.0).max() > 5.0 * limit  # as one for all would be
+    none = _charged_f(SimpleNamespace(**{**vars(record), "tracks": tracks[:, :0]}), scale, sensed,
+                      middle_s, switch_s)  # fmt: skip
+    assert none[0] == sensed.capacitance_f[0]
+    assert none[1] == np.median(sensed.capacitance_f[sensed.valid])

@@ -22,6 +22,7 @@ from numpy.typing import NDArray
 from haselab.actuators import ActuatorLaw
 from haselab.base import InputError
 from haselab.identify.physical.misfit import CAPACITANCE, LENGTH, TRACKED_ZERO_M, Misfit
+from haselab.identify.physical.misstated import WrongScale, find_wrong_scale, suspect_scale
 from haselab.identify.physical.plausible import find_implausible, motion_before_drive
 from haselab.identify.physical.record import MotionRecord
 from haselab.identify.physical.residuals import (
@@ -136,6 +137,7 @@ def _fit(
         found, fault = _judge_early(plain, start.without((CAMERA_SCALE,)), found)
         if fault:
             return ActuatorFit(status=fault, kind=law.kind, evaluations=found.evaluations)
+    lacking = start
     if rejected:
         start = start.with_law(found.unknowns.present_law(), found.unknowns.drifts)
     misfit, found = _weighed(
@@ -144,18 +146,23 @@ def _fit(
     anew = _from_start(misfit, start, found)
     if anew is not None and anew is not found:
         misfit, found = _weighed(misfit, start.at(anew.unknowns), anew)
-    misfit, found, more = _with_effects(misfit, start, found)
-    rejected += more
+    scaled = _scale_instead(misfit, lacking, found, rejected) if rejected else None
+    if scaled is None:
+        misfit, found, more, scaled = _with_effects(misfit, start, found)
+        rejected += more
+    if scaled is not None:
+        misfit, found = _weighed(scaled.misfit, scaled.found.unknowns, scaled.found)
     seen = channel_residuals(misfit, found)
     if len(records) > 1 and seen.excess[0] > _APART and _each_alone(misfit, start):
         return ActuatorFit(status=_CONTRADICT, kind=law.kind, evaluations=found.evaluations)
     if len(records) > 1 and (moved := _moved_zero(misfit, found)):
         return ActuatorFit(status=moved, kind=law.kind, evaluations=found.evaluations)
     # beside a model error, the evidence for another elastic law would mean nothing
-    others = compare_elastic_laws(misfit, found) if seen.explained else []
+    certain = seen.explained and scaled is None
+    others = compare_elastic_laws(misfit, found) if certain else []
     rejected += [rival for rival in others if rival.log_evidence < 0.0]
     preferred = [rival for rival in others if rival.log_evidence > 0.0]
-    return result_of(misfit, _ordered(found), rejected, preferred)
+    return result_of(misfit, _ordered(found), rejected, preferred, scaled)
 
 
 def _first_acts(records: Sequence[MotionRecord]) -> str:
@@ -170,7 +177,7 @@ def _moved_zero(misfit: Misfit, found: SearchResult) -> str:
     k = int(np.argmax(np.abs(zeros)))
     if abs(zeros[k]) <= _MOVED:
         return ""
-    std_m = misfit.known[CAMERA_OFFSET]
+    std_m = misfit.own_zero_std_m
     if not channel_residuals(misfit, found).explained:
         # another error of the model may also shift the lengths
         known = {**misfit.known, CAMERA_OFFSET: _MOVED * abs(float(zeros[k])) * std_m}
@@ -189,7 +196,7 @@ def _moved_zero(misfit: Misfit, found: SearchResult) -> str:
 
 def _with_effects(
     misfit: Misfit, start: Unknowns, found: SearchResult
-) -> tuple[Misfit, SearchResult, list[Rival]]:
+) -> tuple[Misfit, SearchResult, list[Rival], WrongScale | None]:
     """Add effects that the law lacks, as long as the records prefer one decisively.
 
     Args:
@@ -197,7 +204,8 @@ def _with_effects(
         start: where the user began.
         found: before.
     Returns:
-        Misfit with its noise, minimum, and the laws without these effects.
+        Misfit with its noise, minimum, the laws without these effects, and lengths of a wrong scale
+            if they explain the records as well as a further effect.
     """
     rejected: list[Rival] = []
     for _ in range(_MOST_ADDED):
@@ -207,12 +215,32 @@ def _with_effects(
         again = refine(misfit, better.start, found.evaluations)
         if again is not None and again.converged and not _explains(misfit, found, again):
             break
+        # before another search, which takes long
+        if scaled := find_wrong_scale(misfit, found, again, (better.effect,)):
+            return misfit, found, rejected, scaled
         again = _from_start(misfit, better.start.at(start), again, explained=True)
         if again is None or not _explains(misfit, found, again):
             break
         misfit, found = _weighed(misfit, again.unknowns, again)
         rejected.append(Rival(f"without {better.effect}", -better.log_evidence))
-    return misfit, found, rejected
+    suspect = not channel_residuals(misfit, found).explained or suspect_scale(misfit, found)
+    return misfit, found, rejected, find_wrong_scale(misfit, found) if suspect else None
+
+
+def _scale_instead(
+    misfit: Misfit, lacking: Unknowns, found: SearchResult, rejected: Sequence[Rival]
+) -> WrongScale | None:
+    """Lengths of a wrong scale, if they explain the records as well as all effects of a search.
+
+    Args:
+        misfit: that was minimised.
+        lacking: numbers of the law without these effects.
+        found: minimum with them.
+        rejected: laws without each of them.
+    """
+    without = refine(misfit, lacking.at(found.unknowns), found.evaluations)
+    words = tuple(rival.law.removeprefix("without ") for rival in rejected)
+    return None if without is None else find_wrong_scale(misfit, without, found, words)
 
 
 def _explains(misfit: Misfit, before: SearchResult, after: SearchResult) -> bool:

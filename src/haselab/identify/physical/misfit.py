@@ -286,6 +286,8 @@ class Misfit:
         known: standard deviations of what is known of an instrument beforehand, by its name; each
             is one more residual, after those of the records.
         strict: whether a motion outside the law's limits counts as none.
+        zero_std_m: standard deviation of the zero of the lengths of each of several records; None:
+            that of the camera's offset in `known`.
     """
 
     records: Sequence[MotionRecord]
@@ -293,6 +295,14 @@ class Misfit:
     capacitance_factor: float = 1.0
     known: Mapping[str, float] = field(default_factory=dict)
     strict: bool = False
+    zero_std_m: float | None = None
+
+    @property
+    def own_zero_std_m(self) -> float:
+        """Standard deviation of the zero of the lengths of each of several records."""
+        if self.zero_std_m is not None:
+            return self.zero_std_m
+        return self.known.get(CAMERA_OFFSET, TRACKED_ZERO_M)
 
     @cached_property
     def _shared(self) -> list[list[SharedErrors]]:
@@ -302,8 +312,7 @@ class Misfit:
             std_m = self.length_factor * record.length_std_m
             parts = [SharedErrors.of(record, std_m)]
             if len(self.records) > 1:
-                zero_std_m = self.known.get(CAMERA_OFFSET, TRACKED_ZERO_M)
-                parts.append(SharedErrors.of_zero(parts[0], std_m, zero_std_m))
+                parts.append(SharedErrors.of_zero(parts[0], std_m, self.own_zero_std_m))
             found.append(parts)
         return found
 

@@ -9,29 +9,41 @@ $\delta\theta = (J^\top J)^{-1} J^\top g\,a$
 
 where $a$ is the error that alone explains $s$. The largest of these moves counts as one standard
 deviation.
+
+Lengths of a wrong scale may also leave residuals that an effect imitates which the law lacks.
+Before such an effect is added, the scale and the zero of the lengths are estimated from the
+records. With sums of squares $S$, the logarithm of evidence of $k$ effects over the wrong scale is
+
+$\tfrac12 (S_\text{scale} - S_\text{effects}) - (k - 1) \ln N$
+
+since an effect has two parameters, as scale and zero have together.
 """
 
 from __future__ import annotations
 
 import math
 from collections.abc import Iterator, Sequence
-from dataclasses import replace
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
 
 from haselab.identify.physical.misfit import Misfit
 from haselab.identify.physical.record import MotionRecord
-from haselab.identify.physical.search import SearchResult
-from haselab.identify.physical.unknowns import CAMERA_SCALE, SENSING_SCALE
+from haselab.identify.physical.residuals import channel_residuals
+from haselab.identify.physical.rivals import DECISIVE
+from haselab.identify.physical.search import SearchResult, refine
+from haselab.identify.physical.unknowns import CAMERA_OFFSET, CAMERA_SCALE, SENSING_SCALE
 
-__all__ = ["misstated_std", "scale_error"]
+__all__ = ["WrongScale", "find_wrong_scale", "misstated_std", "scale_error", "suspect_scale"]
 
 Floats = NDArray[np.float64]
 _CAREFUL = 0.005  # error of the capacitance that a careful calibration has
 _SURE = 2.0  # standard deviations from which an error is one
 _LITTLE = 1e-4  # relative change of gain or mass, for the derivative
 _MOST = 0.2  # error of a gain, a mass or the camera's scale
+_SUSPECTED = 1e-3  # error of the scale that is suspected without visible residuals
+_WIDE = 0.05  # relative standard deviation of the scale; of the zero, over the longest length
 
 
 def scale_error(scale: float, std: float) -> float:
@@ -110,3 +122,95 @@ def _misstated(records: Sequence[MotionRecord]) -> Iterator[list[MotionRecord]]:
     if len(records) > 1:
         for k in range(len(records)):
             yield [*records[:k], heavier[k], *records[k + 1 :]]
+
+
+@dataclass(frozen=True)
+class WrongScale:
+    """A fit in which scale and zero of the lengths are estimated.
+
+    Args:
+        misfit: with hardly any knowledge of both.
+        found: its minimum.
+        energy: sum of the squares that the stated scale leaves beyond it.
+        instead_of: effects that explain the records hardly better, in words; empty: none.
+    """
+
+    misfit: Misfit
+    found: SearchResult
+    energy: float
+    instead_of: str
+
+    @property
+    def status(self) -> str:
+        """The model error that it is."""
+        scale = self.found.unknowns.value(CAMERA_SCALE)
+        effects = self.instead_of
+        than = f"about as well as {effects}" if effects else "better than the stated scale"
+        return (
+            f"model error: lengths that are {scale:.4f} times the true ones explain the records "
+            f"{than}. Check the scale of the camera or the gain of the displacement sensor; the "
+            "intervals are wider for it"
+        )
+
+
+def find_wrong_scale(
+    misfit: Misfit,
+    without: SearchResult,
+    effects: SearchResult | None = None,
+    words: tuple[str, ...] = (),
+) -> WrongScale | None:
+    """Estimate scale and zero of the lengths, and compare with effects that the law lacks.
+
+    Args:
+        misfit: that was minimised.
+        without: its result without these effects.
+        effects: its minimum with them; None: there are none that explain the records.
+        words: these effects.
+    Returns:
+        The fit, if nothing but noise is left, it explains the records decisively better than the
+            stated scale, and the effects are not decisively better than it.
+    """
+    lengths_m = [float(abs(record.length_m).max()) for record in misfit.records
+                 if record.length_m.size]  # fmt: skip
+    if not lengths_m or not {CAMERA_OFFSET, CAMERA_SCALE} <= set(without.unknowns.names):
+        return None
+    wide = {CAMERA_OFFSET: _WIDE * max(lengths_m), CAMERA_SCALE: _WIDE}
+    free = replace(misfit, known={**misfit.known, **wide}, zero_std_m=misfit.own_zero_std_m)
+    found = refine(free, without.unknowns, without.evaluations)
+    if found is None or not (found.converged and channel_residuals(free, found).explained):
+        return None
+    energy, one = _squares(without) - _squares(found), math.log(found.residuals.size)
+    if 0.5 * energy - one < DECISIVE:
+        return None
+    if effects is not None:
+        ahead = 0.5 * (_squares(found) - _squares(effects)) - (len(words) - 1) * one
+        if ahead > DECISIVE:
+            return None
+    return WrongScale(free, found, energy, " and ".join(words))
+
+
+def suspect_scale(misfit: Misfit, found: SearchResult) -> bool:
+    """Whether the residuals would shrink decisively with another scale of the lengths.
+
+    By the derivatives at the minimum alone, so that it takes no time.
+
+    Args:
+        misfit: that was minimised.
+        found: its minimum.
+    """
+    if CAMERA_SCALE not in found.unknowns.names:
+        return False
+    residuals, columns = found.residuals.copy(), found.jacobian.copy()
+    for part in misfit.segments:
+        if not part.experiment:
+            residuals[part.rows], columns[part.rows] = 0.0, 0.0
+    scale = np.linalg.norm(columns, axis=0)
+    scale[scale == 0.0] = 1.0
+    step = np.linalg.lstsq(columns / scale, residuals, rcond=1e-9)[0]
+    gained = _squares(found) - float(np.sum((residuals - columns / scale @ step) ** 2))
+    error = float((step / scale)[found.unknowns.names.index(CAMERA_SCALE)])
+    return abs(error) > _SUSPECTED and 0.5 * gained - math.log(residuals.size) > DECISIVE
+
+
+def _squares(result: SearchResult) -> float:
+    return float(result.residuals @ result.residuals)

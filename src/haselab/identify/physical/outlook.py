@@ -18,7 +18,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
-from haselab.base import ResultError
+from haselab.base import InputError
 from haselab.identify.physical.information import RELATIVE, covariance_of
 from haselab.identify.physical.misfit import SharedErrors, model_record
 from haselab.identify.physical.record import MotionRecord
@@ -58,19 +58,19 @@ class Outlook:
             covariance: of the values, finite. Shape `(P, P)`.
             excess_variance: of the records over that with white residuals.
         Raises:
-            ResultError: The covariance is not finite and positive.
+            InputError: The covariance is not finite and positive.
         """
         unit = unknowns.slopes * unknowns.vague_widths
         relative = covariance / np.outer(unit, unit)
         std = np.sqrt(np.diag(relative))
         if not (np.isfinite(relative).all() and (std > 0.0).all()):
-            raise ResultError(
+            raise InputError(
                 "The covariance of the physical model is not finite and positive. Identify the "
                 "actuator again."
             )
         size, axes = np.linalg.eigh(relative / np.outer(std, std))
         if size[0] < -1e-6 * size[-1]:
-            raise ResultError(
+            raise InputError(
                 "The covariance of the physical model has a negative eigenvalue. Identify the "
                 "actuator again."
             )

@@ -29,7 +29,7 @@ from haselab.identify.physical.information import (
     vague_information,
 )
 from haselab.identify.physical.misfit import CAPACITANCE, LENGTH, Misfit, Segment
-from haselab.identify.physical.misstated import misstated_std, scale_error
+from haselab.identify.physical.misstated import WrongScale, misstated_std, scale_error
 from haselab.identify.physical.model_error import hidden_std, widen_std
 from haselab.identify.physical.record import MotionRecord
 from haselab.identify.physical.residuals import (
@@ -202,7 +202,11 @@ class ActuatorFit(Fit):
 
 
 def result_of(
-    misfit: Misfit, found: SearchResult, rejected: Sequence[Rival], preferred: Sequence[Rival]
+    misfit: Misfit,
+    found: SearchResult,
+    rejected: Sequence[Rival],
+    preferred: Sequence[Rival],
+    scaled: WrongScale | None = None,
 ) -> ActuatorFit:
     """The fit of a minimum.
 
@@ -211,6 +215,7 @@ def result_of(
         found: the minimum.
         rejected: laws that the records contradict.
         preferred: laws that the records prefer.
+        scaled: lengths of a wrong scale, if the minimum is theirs.
     Returns:
         Estimates, or the reason why there are none.
     """
@@ -230,6 +235,8 @@ def result_of(
         return ActuatorFit(status=status, kind=unknowns.law.kind, evaluations=found.evaluations)
     white = covariance_of([found.jacobian, np.diag(np.sqrt(prior))])
     energy = seen.excess_energy if status != "ok" else 0.0
+    if scaled is not None:
+        status, energy = scaled.status, max(energy, scaled.energy)
     if status != "ok":
         covariance = widen_std(covariance, hidden_std(found.jacobian, energy, prior))
     scale_std = float(np.sqrt(np.diag(covariance))[unknowns.names.index(SENSING_SCALE)])

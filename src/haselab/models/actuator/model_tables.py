@@ -6,9 +6,16 @@ inside double precision.
 
 from __future__ import annotations
 
-from typing import Annotated, Any
+from typing import Annotated, Any, Self
 
-from pydantic import BaseModel, BeforeValidator, ConfigDict, Field, field_validator
+from pydantic import (
+    BaseModel,
+    BeforeValidator,
+    ConfigDict,
+    Field,
+    field_validator,
+    model_validator,
+)
 
 from haselab.base.numbers_only import numbers_only
 
@@ -27,6 +34,7 @@ __all__ = [
 
 _MOST_MODES, _MOST_FACTORS = 16, 64
 _LARGEST, _FASTEST_RAD_S, _LONGEST_S = 1e30, 1e7, 1e7
+_FINEST_CELL = 1e-100  # a smaller one is a typing error, and differences over it may overflow
 
 
 def _value(item: Any) -> Any:
@@ -129,6 +137,15 @@ class TrainingOutputTable(_Table):
     cell: Annotated[Number, Field(ge=0)]
     quantised: bool = False
     hashes: list[Annotated[int, Field(strict=True, ge=0, lt=1 << 32)]]
+
+    @model_validator(mode="after")
+    def _wide_enough(self) -> Self:
+        if self.hashes and self.cell < _FINEST_CELL:
+            raise ValueError(
+                f"cell is {self.cell:g}, but hashes need cells above 0. Restore the value that "
+                "was written, or remove training_output"
+            )
+        return self
 
 
 class OriginTable(_Table):

@@ -237,11 +237,12 @@ def _covariance_fault(matrix: NDArray[np.float64]) -> str:
     variances = np.diag(matrix)
     if (variances < 0.0).any():
         return f"has a negative variance ({variances.min():.3g})"
+    if (variances == 0.0).any():
+        return "has a variance of 0"
     known = np.isfinite(variances)
     finite = matrix[np.ix_(known, known)]
     std = np.sqrt(variances[known])
-    unit = np.where(std > 0.0, std, 1.0)
-    correlations = finite / np.outer(unit, unit)
+    correlations = finite / np.outer(std, std)
     if not np.isfinite(correlations).all():
         return "has a covariance that is not finite beside finite variances"
     if (np.abs(correlations - correlations.T) > _ROUNDED).any():
@@ -310,6 +311,7 @@ class PhysicalRecords(_Section):
     capacitance_std_f: _Positive | None = None
     exposure_s: Annotated[Number, Field(ge=0)] = 0.0
     pixel_m: Annotated[Number, Field(ge=0)] = 0.0
+    lengths_m: _Range | None = None  # shortest and longest that was seen; None: not known
     excess_variance: Annotated[Number, Field(ge=1)] = 1.0  # over that with white residuals
 
 

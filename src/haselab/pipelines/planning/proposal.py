@@ -9,6 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from haselab.base import HaselabError, InputError, JsonObject
+from haselab.identify.physical.misfit import model_record
 from haselab.identify.physical.outlook import Outlook
 from haselab.identify.physical.record import MotionRecord
 from haselab.models.actuator.sections import PhysicalRecords
@@ -22,6 +23,7 @@ Floats = NDArray[np.float64]
 DETERMINED = 0.1  # relative standard deviation of a parameter that counts as determined
 _PARTNERS = 6  # best experiments of which pairs are tried
 _IMPROVES = 0.9  # of the standard deviation: an experiment that helps
+_MARGIN = 0.05  # of the range of the records, by which an experiment may exceed it
 _SOFTENING = "softening"
 
 
@@ -168,7 +170,23 @@ class Planner:
                 f"{top_kg:g} kg is heavier than any mass so far ({self.within.heaviest_kg:g} kg): "
                 "make sure that actuator and clamps withstand it."
             )
-        return tuple(found)
+        return (*found, *self._further(candidate))
+
+    def _further(self, candidate: Candidate) -> tuple[str, ...]:
+        """A note if a study moves the actuator further than the records."""
+        seen_m, written = self.records.lengths_m, self._written(candidate)
+        if seen_m is None or written is None:
+            return ()
+        lengths_m = model_record(self.outlook.unknowns, written[2], derivatives=False).length_m
+        low_m, high_m = float(lengths_m.min()), float(lengths_m.max())
+        margin_m = _MARGIN * (seen_m[1] - seen_m[0])
+        if low_m > seen_m[0] - margin_m and high_m < seen_m[1] + margin_m:
+            return ()
+        return (
+            f"The experiment moves the actuator from {1e3 * low_m:.3g} to {1e3 * high_m:.3g} mm, "
+            f"further than the records ({1e3 * seen_m[0]:.3g} to {1e3 * seen_m[1]:.3g} mm): make "
+            "sure that the actuator withstands it and that nothing is in its way.",
+        )
 
     def _pairs(
         self, tried: Sequence[tuple[float, float, Candidate]], index: int

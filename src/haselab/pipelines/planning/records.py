@@ -30,6 +30,7 @@ def summary_of(
     names = dict.fromkeys(name for record in records for name in record.experiments)
     ripple_v2 = [part[part > 0.0] for part in (drive.ripple_v2 for drive in drives)]
     ripple = np.concatenate(ripple_v2)
+    lengths_m = np.concatenate([record.length_m for record in records])
     return PhysicalRecords(
         experiments=tuple(names),
         duration_s=sum(float(np.ptp(drive.edge_s)) for drive in drives),
@@ -41,6 +42,7 @@ def summary_of(
         capacitance_std_f=_known(fit.capacitance_noise_f),
         exposure_s=first.exposure_s,
         pixel_m=first.pixel_m,
+        lengths_m=(float(lengths_m.min()), float(lengths_m.max())) if lengths_m.size else None,
         excess_variance=fit.excess_variance,
     )
 

@@ -119,25 +119,41 @@ def test_two_campaigns_on_one_thread_keep_their_processes(plan: Plan) -> None:
 def test_on_a_dask_cluster_a_case_that_hangs_fails_and_no_process_is_left(
     plan: Plan, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
+    """The cluster lives on, so that its workers would keep the processes of the campaign."""
+    import distributed
     import psutil
 
     monkeypatch.setenv("PYTHONPATH", str(tmp_path / "package"))  # for the workers
     folder = tmp_path / "out"
     open_folder(plan, folder)
-    before = set(psutil.Process().children(recursive=True))
-    found = run_cases(
-        plan, folder, lambda problem, count: dask.DaskExecutor(problem, dask.LOCAL, 1, 5.0),
-        SilentProgress(),
-    )  # fmt: skip
+    with distributed.LocalCluster(
+        n_workers=1, threads_per_worker=1, dashboard_address="127.0.0.1:0"
+    ) as cluster:
+        (worker,) = cluster.workers.values()
+
+        def computing() -> list[str]:
+            children = psutil.Process(worker.pid).children(recursive=True)
+            return [
+                line for one in children if "resource_tracker" not in (line := str(one.cmdline()))
+            ]
+
+        seen: list[int] = []
+
+        class Watched(dask.DaskExecutor):
+            def wait(self, longest_s: float) -> list[Outcome]:
+                seen.append(len(computing()))
+                return super().wait(longest_s)
+
+        found = run_cases(
+            plan, folder,
+            lambda problem, count: Watched(problem, cluster.scheduler_address, 1, 5.0),
+            SilentProgress(),
+        )  # fmt: skip
+        assert max(seen) == 1 and computing() == []
     assert (found.done, found.failed) == (4, 1)
     rows = finished_rows(plan, folder)
     assert [row.results.get("number") for row in rows] == [0.0, 1.0, None, 3.0, 4.0]
     assert rows[2].error.startswith(ERROR)
-    left = set(psutil.Process().children(recursive=True)) - before
-    psutil.wait_procs(left, 3.0)
-    # Python keeps two processes until this one ends; what they started has their command line
-    names = ["resource_tracker" in str(one.cmdline()) for one in left if one.is_running()]
-    assert names.count(True) <= 1 and names.count(False) <= 1
 
 
 def test_cases_without_a_row_are_computed_again(campaigns: Any, tmp_path: Path) -> None:

@@ -79,7 +79,7 @@ class StrainSimulation:
         task: name of a task.
         slots: number of loops.
         devices: how many different devices are drawn, or the devices; each episode takes one. A
-            twin as such is driven from 0 to 2 V, and has strain 0 at 1.04 V, like the public twin.
+            `TwinConfig` is driven from 0 to 2 V, and has strain 0 at 1.04 V, like the public twin.
         devices_seed: of the drawn devices.
         episode_s: duration of an episode, in s.
     Raises:
@@ -325,7 +325,8 @@ def _reach(pool: _Pool) -> tuple[Floats, Floats]:
             first = next(k for k in range(count) if ends.fault(k))
             raise InputError(
                 f"Device {first} breaks down, or leaves the lengths in which its law is valid, at "
-                f"a drive of {held[first]:.3g} V. Leave it out, or give a Device with a lower high_v."
+                f"a drive of {held[first]:.3g} V. Leave it out, or give a Device with a lower "
+                "high_v."
             )
         found.append(length_m / pool.zero_m - 1.0)
     return found[0], found[1]

@@ -159,6 +159,8 @@ def test_a_case_alone_has_the_results_of_the_table_and_writes_nothing(
     [
         ((), 2, "Missing option '--out'"),
         (("--out", "full/notes.txt"), 2, "--out names a file, not a folder"),
+        (("--case", "1", "--out", "full", "--force"), 2, "--case computes one case here"),
+        (("--case", "1", "--retry-failed"), 2, "--case computes one case here"),
         (("--case", "2"), 2, "--case is 2, but the campaign has the cases 0 to 1"),
         (("--out", "full"), 2, "not empty and holds no campaign"),
         (("--out", "new", "--compare", "full"), 2, "This folder has no results.parquet"),

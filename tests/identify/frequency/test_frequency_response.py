@@ -2,7 +2,7 @@
 
 import numpy as np
 import pytest
-from scipy.signal import csd, max_len_seq, welch
+from scipy.signal import csd, lfilter, max_len_seq, welch
 
 from haselab.base import InputError
 from haselab.identify.frequency.response import estimate_frequency_response
@@ -351,6 +351,19 @@ def test_a_clipped_output_has_no_result_and_an_unclipped_one_has(drive, more):
     # The median of rows whose noise is normal: known to a tenth of its deviation with 100 of them.
     limit = float(response.status.split("stays at ")[1].split()[0])
     assert abs(limit - 1.0 - half) < 0.5 * float(noise.std()) + 1e-3
+
+
+@pytest.mark.parametrize("level", [0.85, 0.9, 0.95])
+def test_a_clipped_output_is_named_with_coloured_noise_too(level):
+    """AR(1) noise of 3 % with the coefficient 0.95: its second differences are small."""
+    rng = np.random.default_rng(3)
+    y = FAST.simulate(FAST_DRIVES["multisine"], 200.0, FAST_S)
+    white = rng.normal(size=y.size)
+    noise = lfilter([1.0], [1.0, -0.95], white)
+    noise *= 0.03 * y.std() / noise.std()
+    clipped = np.minimum(y, np.quantile(y, level)) + noise
+    assert "clipped" in estimate(FAST_DRIVES["multisine"], clipped, 200.0).status
+    assert estimate(FAST_DRIVES["multisine"], y + noise, 200.0).status == "ok"
 
 
 @pytest.mark.parametrize("seed", range(3))

@@ -69,7 +69,7 @@ __all__ = ["command"]
     help="Compare the results with those of the campaign in this folder. Default: none.",
 )  # fmt: skip
 @answer_options(
-    OutputRule("joined"),
+    OutputRule(lambda parameters: "joined" if parameters.get("index") is None else "last"),
     "It is a folder for the finished cases and the results; a campaign in it continues.  "
     "[required]",
 )
@@ -92,6 +92,11 @@ def command(
     work.
     """
     if index is not None:
+        if out is not None or other is not None or scheduler is not None or retry_failed:
+            raise click.UsageError(
+                "--case computes one case here and writes nothing. Leave out --out, --compare, "
+                "--scheduler and --retry-failed."
+            )
         _compute_one(Plan(load_campaign(campaign)), index, as_json=as_json)
         return
     if out is None:

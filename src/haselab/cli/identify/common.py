@@ -70,7 +70,7 @@ OUTPUT = shared_option("--output", default="y", show_default=True)
 
 _SHORTER = {  # parts of an answer that nobody reads on the screen
     "covariance": "of all parameters (use --json or --out)",
-    "training_output": "kept, so that haselab compare recognises these records",
+    "training_output": "stored for haselab compare (use --json or --out)",
 }
 _COPY = 0.9  # share of the samples of a record, above which it is a copy of another one
 
@@ -206,6 +206,7 @@ def read_recorded(
     *,
     hold: str | None = None,
     through: Path | None = None,
+    to_strain: bool = True,
 ) -> Recorded:
     """Read the records of a file.
 
@@ -217,8 +218,9 @@ def read_recorded(
         columns: what the user states about the columns.
         hold: how the input behaves between its updates; None: not stated, so held is assumed.
         through: actuator file whose voltage map converts the input from V to strain. The input is
-            then a commanded voltage, which is held. An output in m is converted to strain, too, if
-            the file has the length at strain 0.
+            then a commanded voltage, which is held.
+        to_strain: with `through`, also convert an output in m to strain if the file has the length
+            at strain 0.
     Returns:
         The records.
     Raises:
@@ -236,7 +238,7 @@ def read_recorded(
         known = load_actuator(through)
         changed = {names[0]: known.voltage_map().strain(table[names[0]])}
         units = "1", units[1]
-        if units[1] == "m" and known.actuator.geometry.zero_length_m is not None:
+        if to_strain and units[1] == "m" and known.actuator.geometry.zero_length_m is not None:
             output, stated = names[1], table.units[names[1]]
             changed[output] = strains_of(output, table[output], stated, file, known)
             units = "1", "1"
@@ -332,7 +334,8 @@ def read_quantities(
     Returns:
         Values of each. Shape `(N,)`.
     Raises:
-        InputError: a column is missing, its unit belongs to another quantity, or see `strains_of`.
+        InputError: a column is missing, or its unit belongs to another quantity; see also
+            `strains_of`.
     """
     names = {quantity: quantity.column(file, given) for quantity, given in wanted.items()}
     table = read_valid(file, list(names.values()), columns, [each.option for each in names])

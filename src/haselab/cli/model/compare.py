@@ -158,8 +158,9 @@ def command(
     for file in files:
         with name_files_in_errors(file):
             found = read_recorded(
-                file, (source, output), rate_hz, held_at_hz, columns, hold=hold, through=through
-            )
+                file, (source, output), rate_hz, held_at_hz, columns, hold=hold, through=through,
+                to_strain=origin.output_unit != "m",
+            )  # fmt: skip
             _check_units(origin, found.units, (source, output), through_voltage_map)
             records += found.records
     with name_files_in_errors(*files):

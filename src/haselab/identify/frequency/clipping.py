@@ -19,8 +19,7 @@ _BETTER = 50.0  # twice the gain of logarithmic likelihood that identifies a lim
 _FOLLOWS = 0.3  # slope of the outputs beyond a limit over the prediction; 0 where they are clipped
 _EXTREME = 0.999  # of the outputs lie below the limit plus ...
 _CLEAR = 4.0  # ... this many standard deviations of the noise
-_CONSTANT = 1.5  # largest median deviation from a limit over that of the prediction elsewhere, or
-_FLAT = 0.1  # over the standard deviation of the prediction beyond the limit
+_CONSTANT = 1.5  # largest median deviation from a limit over that of the prediction elsewhere
 _EXPLAINED = 0.1  # largest share of the outputs' energy in the residuals
 _LEAST_ROWS = 10
 _LEAST_VISITS = 2
@@ -81,14 +80,13 @@ def _rail(y: Floats, predicted: Floats) -> float | None:
         there, modelled = y[beyond], predicted[beyond]
         rail = float(np.median(there))
         along = modelled - modelled.mean()
-        if float(along @ there) > _FOLLOWS * float(along @ along):
+        if abs(float(along @ there)) > _FOLLOWS * float(along @ along):
+            continue  # a curve, such as the trough of a response to the square of a voltage
+        elsewhere = float(np.median(np.abs(y[~beyond] - predicted[~beyond])))
+        if float(np.median(np.abs(there - rail))) > _CONSTANT * elsewhere:
             continue
         if extreme - rail > _CLEAR * float(there.std()):
             continue  # an extreme value that is reached often, not a limit
-        elsewhere = float(np.median(np.abs(y[~beyond] - predicted[~beyond])))
-        steady = max(_CONSTANT * elsewhere, _FLAT * float(modelled.std()))
-        if float(np.median(np.abs(there - rail))) > steady:
-            continue  # a curve, such as the trough of a response to the square of a voltage
         off = float(((there - modelled) ** 2).sum())
         limited = float(((there - rail) ** 2).sum())
         gain = rows * math.log(off / max(limited, 1e-300))

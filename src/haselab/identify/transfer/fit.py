@@ -54,9 +54,9 @@ _UNEXPLAINED = (
     "input; check --input and --output, or fit more poles"
 )
 _NOT_WHITE = (
-    "The residuals are not white: the model does not explain everything, and the intervals hold "
-    "only if its structure is right. Try slow modes (creep) with --slow-modes 1, a curve of the "
-    "input such as the square of a voltage with --choose nonlinear, or --choose all."
+    "The residuals are not white: the model does not explain everything, and the intervals are "
+    "valid only if its structure is right. Try --slow-modes 1 (creep), --choose nonlinear (such as "
+    "the square of a voltage), or --choose all."
 )
 _FEEDBACK = 1e-6  # probability below which the input follows the residuals
 _NO_DISTURBANCE = 99.0  # per cent of fit above which no disturbance matters

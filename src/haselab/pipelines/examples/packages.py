@@ -33,7 +33,10 @@ def write_package(name: str, folder: Path) -> list[Path]:
 
     source = source_folder() / "examples" / "plugins" / name
     if not source.is_dir():
-        raise InputError(f"This installation of haselab lacks the package. Install again. {source}")
+        raise InputError(
+            "This installation of haselab does not contain the example package. Install haselab "
+            f"again. {source}"
+        )
     unwanted = shutil.ignore_patterns("__pycache__", "build", "*.egg-info", ".*")
     shutil.copytree(source, folder, ignore=unwanted, dirs_exist_ok=True)
     return sorted(path for path in folder.rglob("*") if path.is_file())

@@ -32,6 +32,7 @@ __all__ = ["results_of_model"]
 
 Floats = NDArray[np.float64]
 _ROWS = ("S14.", "S15.", "S16.", "S17.", "S18.", "S19.", "S20.", "S21.")
+_SHORT_RUN = 3  # lost blocks that the model's capacitances fill
 _PATIENCE_S = 600.0  # of all fits in the second process
 _IN_STEPS = ("S15.slope_at_strain", "S15.offset_at_strain")  # a sample more changes the cells
 
@@ -237,9 +238,23 @@ class _Motion:
         sensed_f = np.interp(
             seen.sensed_s, seen.sensed_s[used], self.modelled.capacitance_f[blocks]
         )
-        sensed_f[np.isnan(seen.capacitance_f)] = np.nan
-        relative = seen.relative_capacitance * (sensed_f / seen.capacitance_f)
-        return replace(seen, capacitance_f=sensed_f, relative_capacitance=relative)
+        # A few lost blocks move a straight line through a curve, but not the model's.
+        lost = np.isnan(seen.capacitance_f)
+        sensed_f[_long_runs(lost)] = np.nan
+        scale = seen.relative_capacitance / seen.capacitance_f
+        if not lost.all():
+            scale = np.interp(seen.sensed_s, seen.sensed_s[~lost], scale[~lost])
+        return replace(seen, capacitance_f=sensed_f, relative_capacitance=scale * sensed_f)
+
+
+def _long_runs(lost: NDArray[np.bool_]) -> NDArray[np.bool_]:
+    """Lost blocks in runs that are too long to be filled, or at an end."""
+    edges = np.flatnonzero(np.diff(lost, prepend=False, append=False))
+    found = lost.copy()
+    for first, after in zip(edges[::2].tolist(), edges[1::2].tolist(), strict=True):
+        if after - first <= _SHORT_RUN and first > 0 and after < lost.size:
+            found[first:after] = False
+    return found
 
 
 def _matched(time_s: Floats, known_s: Floats) -> tuple[NDArray[np.bool_], NDArray[np.int64]]:

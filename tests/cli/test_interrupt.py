@@ -174,3 +174,25 @@ def test_the_console_script_and_the_module_start_in_the_same_place() -> None:
     assert "from haselab.cli.entry import main" in Path(start.__file__).with_name(
         "__main__.py"
     ).read_text()  # fmt: skip
+
+
+def test_an_interrupted_program_ends_without_the_destructors_of_libraries(tmp_path: Path) -> None:
+    """But after its threads, its exit functions and its output; another exit code ends as usual."""
+    text = (
+        "import atexit, ctypes, sys, threading, time\n"
+        "from haselab.cli.main import end_despite_threads\n"
+        "libc = ctypes.CDLL(None)\n"
+        "libc.__cxa_atexit(libc.abort, None, None)\n"  # as the destructor of a library
+        "atexit.register(lambda: print('exit function'))\n"
+        "threading.Thread(target=lambda: (time.sleep(0.3), print('thread'))).start()\n"
+        "stop = SystemExit(int(sys.argv[1]))\n"
+        "end_despite_threads(stop)\n"
+        "raise stop\n"
+    )
+    ends = []
+    for code in ("130", "3"):
+        done = subprocess.run([sys.executable, "-c", text, code], capture_output=True, text=True,
+                              timeout=100.0, check=False)  # fmt: skip
+        ends.append((done.returncode, done.stdout.split("\n")[:2]))
+    assert ends[0] == (130, ["thread", "exit function"])
+    assert ends[1] == (-6, ["thread", "exit function"]), "the destructor runs"

@@ -180,11 +180,13 @@ def test_an_interrupted_program_ends_without_the_destructors_of_libraries(tmp_pa
     """But after its threads, its exit functions and its output; another exit code ends as usual."""
     text = (
         "import atexit, ctypes, sys, threading, time\n"
+        "from concurrent.futures import ThreadPoolExecutor\n"
         "from haselab.cli.main import end_despite_threads\n"
         "libc = ctypes.CDLL(None)\n"
         "libc.__cxa_atexit(libc.abort, None, None)\n"  # as the destructor of a library
         "atexit.register(lambda: print('exit function'))\n"
         "threading.Thread(target=lambda: (time.sleep(0.3), print('thread'))).start()\n"
+        "ThreadPoolExecutor(1).submit(int)\n"  # its thread ends only if it is asked to
         "stop = SystemExit(int(sys.argv[1]))\n"
         "end_despite_threads(stop)\n"
         "raise stop\n"

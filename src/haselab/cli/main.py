@@ -181,9 +181,7 @@ def end_despite_threads(stop: SystemExit) -> None:
             code,
         )
     elif code == _INTERRUPTED:
-        for thread in threading.enumerate():
-            if thread is not threading.current_thread() and not thread.daemon:
-                thread.join()
+        threading._shutdown()  # type: ignore[attr-defined]  # ends and joins those of pools, too
     else:
         return
     with contextlib.suppress(Exception):

@@ -34,8 +34,8 @@ _IN_HZ = "printed in rad/s; the same number in Hz is {:.1f} rad/s"
 _PLAIN = {
     "S10.rise_printed_chain": "rise time, PI with phase-based sensing",
     "S10.error_printed_chain": "steady-state error, PI with phase-based sensing",
-    "S15.slope": "strain over relative capacitance (eq. 3), slope",
-    "S15.offset": "strain over relative capacitance (eq. 3), offset",
+    "S15.slope": "strain over relative capacitance, slope",
+    "S15.offset": "strain over relative capacitance, offset",
     "S15.slope_at_strain": "strain over relative capacitance, slope, edges averaged by strain",
     "S15.offset_at_strain": "strain over relative capacitance, offset, edges averaged by strain",
     "S19.omega_0": "free response, natural frequency",

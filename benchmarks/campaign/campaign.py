@@ -57,6 +57,7 @@ SETTINGS = {
     "DASK_DISTRIBUTED__WORKER__MEMORY__MONITOR_INTERVAL": "2s",
     "DASK_DISTRIBUTED__ADMIN__TICK__INTERVAL": "1s",
     "DASK_DISTRIBUTED__ADMIN__SYSTEM_MONITOR__INTERVAL": "5s",
+    "MALLOC_TRIM_THRESHOLD_": "268435456",
 }
 # prints the time from the start of the process to the first case that would be computed
 RESUME = """

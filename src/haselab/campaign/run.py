@@ -22,7 +22,7 @@ __all__ = ["Progressed", "run_cases"]
 
 # Computing time of a chunk, so that the time between two is small against it; and so much of it for
 # each worker, because this program takes about 10 ms for each chunk of any worker.
-_CHUNK_S, _CHUNK_S_FOR_EACH = 1.0, 0.02
+_CHUNK_S, _CHUNK_S_FOR_EACH = 2.0, 0.02
 _LAST_CHUNK_S = 0.1  # least computing time of a chunk at the end
 _MOST_IN_CHUNK = 2000
 _AHEAD = 2  # chunks for each worker: one in work and one that waits
@@ -223,7 +223,7 @@ class _Run:
         return self._waiting(block)
 
     def _chunk_size(self, workers: int) -> int:
-        """Cases that take a second or more; at the end less, so that all workers end together."""
+        """Cases that take 2 s or more; at the end less, so that all workers end together."""
         if self._each_s == 0.0:
             return 1
         left = len(self._queue) + sum(len(self._left[block]) for block in self._blocks)

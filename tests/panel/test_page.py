@@ -171,6 +171,24 @@ def test_every_task_is_possible_by_keyboard(page: Page) -> None:
     expect(page.locator("header")).to_contain_text("Bench: tripped", timeout=WAIT_MS)
 
 
+def test_a_page_whose_stop_does_not_answer_cannot_arm(page: Page) -> None:
+    """As behind a tunnel or a firewall that lets only the port of the page through."""
+    page.route("**/ready", lambda asked: asked.abort())
+    page.get_by_role("button", name="Arm the bench").click()
+    said = page.get_by_text(re.compile(r"STOP of this page does not answer at http://127\.0\.0\.1:\d+"))
+    expect(said).to_be_visible(timeout=WAIT_MS)
+    assert page.get_by_label("Highest drive of this run").count() == 0
+    page.unroute("**/ready")
+    page.get_by_role("button", name="Arm the bench").click()
+    page.get_by_label("Highest drive of this run").fill("1.5")
+    page.route("**/ready", lambda asked: asked.abort())  # between the two steps
+    page.get_by_role("button", name="Arm", exact=True).click()
+    expect(said).to_be_visible(timeout=WAIT_MS)
+    expect(page.locator("header")).not_to_contain_text("Bench: armed")
+    page.unroute("**/ready")
+    arm(page)
+
+
 def test_frozen_data_look_frozen_and_come_back(page: Page, panel: RunningPanel) -> None:
     before = page.evaluate("document.querySelector('.values').textContent")
     assert before

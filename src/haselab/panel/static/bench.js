@@ -14,6 +14,8 @@ export function Arming({ state, link, say, study = null, onArmed = () => {} }) {
   const cancel = () => { setRequest(null); link.ask("cancel"); };
   useEffect(() => () => { if (open.current) link.ask("cancel"); }, []);
   async function ask() {
+    const obstacle = await stopObstacle();
+    if (obstacle) { say(obstacle); return; }
     const found = await link.ask("request");
     if (found.error) { say(found.error); return; }
     say(""); setKnown(false); setLimit(""); setRequest(found.answer);
@@ -23,7 +25,8 @@ export function Arming({ state, link, say, study = null, onArmed = () => {} }) {
     const values = { number: request.number, limit_v: Number(limit), acknowledged: known ? request.reason : "" };
     if (study !== null) values.study = study;
     setSent(true);
-    const found = await link.ask("arm", values);
+    const obstacle = await stopObstacle();
+    const found = obstacle ? { error: obstacle } : await link.ask("arm", values);
     setSent(false);
     setRequest(null);
     say(found.error || "");

@@ -14,14 +14,14 @@
     state.classList.toggle("bad", bad);
   };
 
+  const answers = () => fetch(`${address}/ready`, { signal: AbortSignal.timeout(2000) }).then((answer) => answer.ok, () => false);
+
+  // Why STOP of this page would not work now; empty if it answers.
+  window.stopObstacle = async () => (await answers() ? "" : `STOP of this page does not answer at ${address}, so it cannot arm the bench. Restart the panel, or, if this page comes through a tunnel, let that port through, too.`);
+
   async function ready() {
-    try {
-      const answer = await fetch(`${address}/ready`, { signal: AbortSignal.timeout(2000) });
-      if (!answer.ok) throw new Error(answer.statusText);
-      if (!pressed) show("STOP: ready", false);
-    } catch {
-      show("STOP DOES NOT ANSWER. Press the emergency stop of the bench.", true);
-    }
+    if (!await answers()) show("STOP DOES NOT ANSWER. Press the emergency stop of the bench.", true);
+    else if (!pressed) show("STOP: ready", false);
     setTimeout(ready, 2000);
   }
 

@@ -7,7 +7,7 @@ import math
 from haselab.base import InputError, ResultError
 from haselab.control.gains import Saturation
 from haselab.control.plants.general import AnyPlant, PlantScale
-from haselab.models.maps import VoltageMap, allow_start
+from haselab.models.maps import VoltageMap, allow_start, require_start
 from haselab.models.plant import Plant
 
 __all__ = ["default_step", "integrates", "reachable_range", "usual_limits"]
@@ -90,11 +90,7 @@ def reachable_range(
     low_v = -math.inf if low_v is None else low_v
     high_v = math.inf if high_v is None else high_v
     found = to_volt.reach((wanted.low, wanted.high), low_v, high_v)
-    if not allow_start((wanted.low, wanted.high)):
-        raise InputError(
-            f"The controller's limits are {wanted.low:g} to {wanted.high:g}, but they must contain "
-            "zero strain, where a loop starts. Widen the limits."
-        )
+    require_start((wanted.low, wanted.high))
     if found is None or not allow_start(found):
         raise ResultError(
             f"The voltage map has zero strain at {float(to_volt.voltage_v(0.0)):.3g} V, but the "

@@ -9,7 +9,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from haselab.base import InputError, LimitError
 
-__all__ = ["LinearMap", "VoltageMap", "allow_start"]
+__all__ = ["LinearMap", "VoltageMap", "allow_start", "require_start"]
 
 Floats = NDArray[np.float64]
 _REACH_POINTS = 1501
@@ -188,3 +188,18 @@ def allow_start(strains: tuple[float, float]) -> bool:
     """
     low, high = strains
     return max(low, -high) <= _NEAR_ZERO * (high - low)
+
+
+def require_start(limits: tuple[float, float]) -> None:
+    """Check that a loop with these limits of its output can start.
+
+    Args:
+        limits: lowest and highest strain.
+    Raises:
+        InputError: it cannot; see `allow_start`.
+    """
+    if not allow_start(limits):
+        raise InputError(
+            f"The controller's limits are {limits[0]:g} to {limits[1]:g}, but they must contain "
+            "zero strain, where a loop starts. Widen the limits."
+        )

@@ -18,7 +18,7 @@ from haselab.firmware import (
 )
 from haselab.models.actuator import ActuatorTables
 from haselab.models.actuator.sections import ControllerSection
-from haselab.models.maps import VoltageMap, allow_start
+from haselab.models.maps import VoltageMap, allow_start, require_start
 from haselab.models.plant import Plant
 from haselab.rig.chip.own_step import controller_step
 from haselab.store.actuator_file import read_run
@@ -151,11 +151,7 @@ def _settings(
             "[controller] has no limits of its output. Design it with haselab design, or add "
             "limits = {low = -0.05, high = 0.1}."
         )
-    if not allow_start((limits.low, limits.high)):
-        raise InputError(
-            f"The limits of [controller] are {limits.low:g} to {limits.high:g}, but they must "
-            "contain zero strain, where a loop starts. Widen the limits."
-        )
+    require_start((limits.low, limits.high))
     if step is None:
         _check_units(tables)
     gains = _NO_GAINS if step is not None else _gains(controller)

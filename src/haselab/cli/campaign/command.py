@@ -70,8 +70,8 @@ __all__ = ["command"]
 )  # fmt: skip
 @answer_options(
     OutputRule(lambda parameters: "joined" if parameters.get("index") is None else "last"),
-    "It is a folder for the finished cases and the results; a campaign in it continues.  "
-    "[required]",
+    "It is a folder for the finished cases and the results; a campaign in it continues. "
+    "Default: none; required without --case.",
 )
 def command(
     campaign: Path,

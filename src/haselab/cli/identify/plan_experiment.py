@@ -82,11 +82,11 @@ _OF_SIGNAL = (
 )  # fmt: skip
 @click.option(
     "--samples-per-s", type=REAL, default=2.0, show_default=True,
-    help="Set the number of output samples per second whose noise is independent.",
+    help="Set how many independent samples of the output a second contains.",
 )  # fmt: skip
 @click.option(
     "--systematic", type=REAL, default=0.05, show_default=True,
-    help="Set the rms error of the models themselves, relative to the output's standard deviation.",
+    help="Set the expected model error, as a share of the output's standard deviation.",
 )  # fmt: skip
 @answer_options(
     None,
@@ -111,8 +111,7 @@ def command(
 
     With --rig, the command designs a drive signal within the limits of the bench. The signal
     separates candidate models, or reduces the confidence interval of a parameter, as well as
-    possible. MODEL is a JSON answer of `identify model-comparison` or `identify transfer`, or the
-    model.json of a run.
+    possible. MODEL is the JSON file of `identify model-comparison` or `identify transfer`.
 
     Without --rig, it finds the shortest study that determines a parameter of the physical model,
     within the limits of [drive]. MODEL is an actuator file with [model.physical].
@@ -177,6 +176,12 @@ def _chart(plan: ExperimentPlan) -> Chart:
 
 
 def _plant(path: Path, baseline_v: float) -> VoltagePlant:
+    if path.suffix == ".toml":
+        raise InputError(
+            f"With --rig, MODEL must be a JSON file of 'identify model-comparison' or 'identify "
+            f"transfer', but {path} is an actuator file. Leave out --rig to plan for its physical "
+            "model."
+        )
     data = read_json(path)
     if isinstance(data, dict) and "voltage_plant" in data:
         table = validated(VoltagePlantTable, data["voltage_plant"], path)

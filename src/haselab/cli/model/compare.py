@@ -17,8 +17,6 @@ from haselab.cli.columns import column_options
 from haselab.cli.common import POSITIVE, REAL, SEED, answer_options, emit, unverified_option
 from haselab.cli.identify.common import (
     FILES,
-    INPUT,
-    OUTPUT,
     RATE,
     name_files_in_errors,
     read_recorded,
@@ -55,8 +53,17 @@ _NO_NOISE = (
 @click.command("compare")
 @click.argument("model", type=click.Path(path_type=Path))
 @FILES
-@INPUT
-@OUTPUT
+@shared_option(
+    "--input",
+    "source",
+    default="u",
+    show_default="u; with a physical model u, voltage_v or voltage",
+)
+@shared_option(
+    "--output",
+    default="y",
+    show_default="y; with a physical model the columns of length, strain, capacitance",
+)
 @RATE
 @shared_option(
     "--model", "which", type=click.Choice(["auto", "physical", "linear"]), default="auto",
@@ -129,8 +136,9 @@ def command(
     recognised by their values, also in a part of a record, in another format and with fewer digits.
     Their share is used_for_fit; it is null if the steps of the converter hide whether the record is
     a copy or a repetition. The exit code is 3 if this share is above 5 %, if the prediction is
-    worse than the mean of the record, if its rms error is more than twice the standard deviation
-    that the band states, or if the record is explained as well without its input.
+    worse than the mean of the record, if its rms error without white noise is more than twice the
+    standard deviation that the band states (3.5 times if the band is the uncertainty of the
+    parameters alone), or if the record is explained as well without its input.
     """
     linear = at_rest or through_voltage_map or held_at_hz is not None
     linear |= hold is not None

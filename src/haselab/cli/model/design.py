@@ -69,9 +69,9 @@ _FEW = 0.9  # share of plausible plants below which a design without --probabili
 )  # fmt: skip
 @shared_option(
     "--controller", "--structure", "structure", default=USUAL_STRUCTURE, show_default=True,
-    detail="pi: as in the paper; pid: with the derivative of the filtered measurement. The "
-    "parameters of other kinds are computed from [model.physical]; for a kind that cannot compute "
-    "them, the command only computes the margins, with the parameters in the file.",
+    detail="pi: as in the paper; pid: with the derivative of the filtered measurement. Other kinds "
+    "need [model.physical]. For a kind without an automatic design, the command only computes the "
+    "margins of the parameters in the file.",
 )  # fmt: skip
 @loop_options
 @click.option(

@@ -38,7 +38,7 @@ _OF_FMU = ("inputs", "outputs", "parameters", "constants")
 )  # fmt: skip
 @shared_option(
     "--seed", type=click.IntRange(0, 2**31 - 1),
-    detail="They are the noise of the monitors with --to fmu. Default: 1.",
+    detail="They are the noise of the monitors; used with --to fmu only. Default: 1.",
 )  # fmt: skip
 @click.option(
     "--input-name", metavar="NAME", help="Set the name of the input. Default: that of the model."

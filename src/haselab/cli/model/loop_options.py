@@ -18,12 +18,12 @@ def loop_options(command: Callable[..., None]) -> Callable[..., None]:
     for option in (
         shared_option(
             "--delay-s", type=REAL,
-            show_default=f"the delay in the model file, else {_USUAL.measurement_delay_s:g}",
+            show_default=f"loop_delay_s in the model file, else {_USUAL.measurement_delay_s:g}",
             detail="Half the sampling period is added for the hold.",
         ),
         shared_option(
             "--rate-hz", type=REAL,
-            show_default=f"the rate in the model file, else {_USUAL.rate_hz:g}",
+            show_default=f"rate_hz in the model file, else {_USUAL.rate_hz:g}",
             detail="It is the rate of the control loop.",
         ),
     ):  # fmt: skip

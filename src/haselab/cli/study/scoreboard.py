@@ -42,11 +42,12 @@ _USUAL_CLASSES = ("host-100hz", "chip-1khz", "oracle")
 )  # fmt: skip
 @click.option(
     "--task", "tasks", multiple=True, metavar="NAME",
-    help="Play this task; repeat the option for several. Default: all tasks.",
+    help=f"Play this task; repeat the option for several: {', '.join(TASKS)}. Default: all tasks.",
 )  # fmt: skip
 @click.option(
     "--class", "classes", multiple=True, type=click.Choice(list(CLASSES)),
-    help="Play in this class of loop; repeat the option for several. Default: all classes.",
+    help="Play in this class of loop; repeat the option for several. host: on a computer; chip: on "
+    "the microcontroller; oracle: with the true law, not ranked. Default: all classes.",
 )  # fmt: skip
 @shared_option("--seed", type=SEED, default=1, show_default=True)
 @click.option(

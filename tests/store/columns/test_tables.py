@@ -116,6 +116,15 @@ def test_a_name_that_is_there_twice_needs_its_group(tmp_path):
     assert read_table(tmp_path / "a.h5", ["two/u"])["two/u"].tolist() == Y.tolist()
 
 
+def test_the_times_of_other_groups_are_not_those_of_a_group_without(tmp_path):
+    """As in an exported session: the samples have a rate, the tables beside them have times."""
+    with h5py.File(tmp_path / "a.h5", "w") as file:
+        file["run/u"], file["run/rate_hz"] = U, 400.0
+        file["run-blocks/time_s"], file["run-strain/time_s"] = [0.0, 1.0], [0.0, 2.0, 4.0]
+    table = read_table(tmp_path / "a.h5", ["run/u"])
+    assert (table["run/u"].tolist(), table.rate_hz) == (U.tolist(), 400.0)
+
+
 def test_a_structure_of_an_old_mat_file_is_opened(tmp_path):
     savemat(tmp_path / "a.mat", {"run": {"u": U, "fs": 400.0}})
     table = read_table(tmp_path / "a.mat", ["u"])

@@ -106,6 +106,8 @@ def time_column(
         exact = f"{group}/time_s" if f"{group}/time_s" in own else None
         if (found := _times_among(archive, options, own, exact, used)) is not None:
             return found
+        if sum(full.endswith("/time_s") for full in archive.names) > 1:
+            return None  # these are the times of other groups
     exact = None if len(groups) > 1 else archive.locate("time_s")
     return _times_among(archive, options, archive.names, exact, used)
 

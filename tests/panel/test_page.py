@@ -175,7 +175,9 @@ def test_a_page_whose_stop_does_not_answer_cannot_arm(page: Page) -> None:
     """As behind a tunnel or a firewall that lets only the port of the page through."""
     page.route("**/ready", lambda asked: asked.abort())
     page.get_by_role("button", name="Arm the bench").click()
-    said = page.get_by_text(re.compile(r"STOP of this page does not answer at http://127\.0\.0\.1:\d+"))
+    said = page.get_by_text(
+        re.compile(r"STOP of this page does not answer at http://127\.0\.0\.1:\d+")
+    )
     expect(said).to_be_visible(timeout=WAIT_MS)
     assert page.get_by_label("Highest drive of this run").count() == 0
     page.unroute("**/ready")

@@ -106,7 +106,7 @@ def sense(
     sensed = Lockin(config).sense_channels(found[v][:used], found[i][:used])
     columns = columns_of(
         sensed,
-        time_s=sensed.time_s,
+        time_s=sensed.time_s + (0.0 if found.time_s is None else float(found.time_s[0])),
         volt_per_reading=1.0,
         frequency_hz=carrier_hz,
         reactance_scale=request.reactance_scale,

@@ -111,6 +111,26 @@ def test_the_rate_of_the_file_is_used_when_none_is_given(
     assert set(COLUMNS) <= set(answer)
 
 
+@pytest.mark.parametrize("start_s", [-0.2, 12.5, 1e5])
+@pytest.mark.parametrize("rate", [[], ["--rate-hz", RATE_HZ]])
+def test_the_times_are_on_the_clock_of_the_file(
+    record: np.ndarray, tmp_path: Path, start_s: float, rate: list[object]
+) -> None:
+    """So that a strain in the same file belongs to the same times, as after a pre-trigger."""
+    source = tmp_path / "m.mat"
+    time_s = start_s + np.arange(len(record)) / RATE_HZ
+    savemat(source, {"v_monitor_v": record[:, 0], "i_monitor_v": record[:, 1], "time_s": time_s})
+    begun_s = []
+    for more in (rate, ["--time", "time_s", *rate]):
+        out = tmp_path / f"{len(begun_s)}.csv"
+        assert run("sense", source, "--carrier-hz", CARRIER_HZ, "--out", out, *more) == 0
+        begun_s.append(read(out)[1]["time_s"])
+    for found in begun_s:
+        wanted = start_s + 0.01 * (np.arange(BLOCKS) + 0.5)
+        # Half a sample, because a block's middle is between two; and 15 digits.
+        assert np.abs(found - wanted).max() < 0.5 / RATE_HZ + 1e-14 * abs(start_s) + 1e-12
+
+
 def test_scales_that_nobody_stated_are_named(
     tmp_path: Path, record: np.ndarray, capsys: pytest.CaptureFixture[str]
 ) -> None:

@@ -193,6 +193,12 @@ def _import(
         answer = asdict(import_session(file, out, plan))
     if assumed := answer.pop("assumed_seconds"):
         note_seconds(assumed, file)
+    if start_s := answer.pop("start_s"):
+        click.echo(
+            f"haselab: the times in {file} begin at {start_s:.9g} s; those of the session begin at "
+            "0.",
+            err=True,
+        )
     emit(answer, as_json=as_json, out=None)
 
 

@@ -90,6 +90,7 @@ class Source:
         volt_per_reading: 1 for records in volts.
         session: of these blocks, if there is one.
         in_monitor_volts: the scale of the voltage was not stated; the default is used.
+        start_s: time of the first sample of a file, by its column of times.
     """
 
     stream: ColumnStream
@@ -97,6 +98,7 @@ class Source:
     volt_per_reading: float
     session: SessionColumns | None = None
     in_monitor_volts: bool = False
+    start_s: float = 0.0
 
     def chunks(self) -> Iterator[tuple[NDArray[Any], ...]]:
         """Yield both columns in parts; all but the last consist of whole blocks."""
@@ -104,10 +106,11 @@ class Source:
         return self.stream.chunks(blocks * self.config.block_samples)
 
     def block_start_s(self, first: int, count: int) -> NDArray[np.float64]:
-        """Time of each block's first sample, shape `(count,)`: the session's clock, or from 0."""
+        """Time of each block's first sample, shape `(count,)`, by the clock of session or file."""
         if self.session is not None:
             return self.session.block_start_s(first, count)
-        return self.config.block_s * np.arange(first, first + count, dtype=np.float64)
+        start_s = self.config.block_s * np.arange(first, first + count, dtype=np.float64)
+        return self.start_s + start_s
 
 
 def open_source(path: Path, request: Request, opened: ExitStack) -> Source:
@@ -211,7 +214,7 @@ def _of_file(path: Path, request: Request, opened: ExitStack) -> Source:
         )
     )  # fmt: skip
     request = at_the_actuator((stream.units[0], stream.units[1]), request, path)
-    rate_hz = _rate_hz(stream, request, path)
+    rate_hz, start_s = _rate_hz(stream, request, path)
     charge = request.method == "charge"
     if request.carrier_hz is None and not charge:
         raise InputError(
@@ -241,7 +244,7 @@ def _of_file(path: Path, request: Request, opened: ExitStack) -> Source:
     else:
         config = lockin_config(request, rate_hz, block_samples)
     unscaled = request.volt_per_monitor_volt is None
-    return Source(stream, config, 1.0, in_monitor_volts=unscaled)
+    return Source(stream, config, 1.0, in_monitor_volts=unscaled, start_s=start_s)
 
 
 def at_the_actuator(
@@ -274,16 +277,16 @@ def at_the_actuator(
     return request
 
 
-def _rate_hz(stream: ColumnStream, request: Request, path: Path) -> float | None:
-    """Sampling rate as given, else from the file; they must not contradict each other."""
+def _rate_hz(stream: ColumnStream, request: Request, path: Path) -> tuple[float | None, float]:
+    """Rate as given, else from the file, which must agree; and the time of the first row."""
     given = request.rate_hz
     if given is None:
-        return stream.rate_hz
+        return stream.rate_hz, stream.start_s
     if stream.rate_hz is not None:
         check_rate(given, stream.rate_hz, _RATE_ROWS, "the file's own rate", path)
-        return given
-    check_times(path, given, request.columns, (request.v_column, request.i_column))
-    return given
+        return given, stream.start_s
+    names = request.v_column, request.i_column
+    return given, check_times(path, given, request.columns, names)
 
 
 def _charge_config(request: Request, rate_hz: float, block_samples: int) -> ChargeConfig:

@@ -129,7 +129,7 @@ class CsvRows:
 def _row_form(valid: bool, words: str) -> str:
     """Format string of one row with these texts."""
     numbers = dict.fromkeys(COLUMNS, "%.9g")
-    numbers |= {"time_s": "%.12g", "valid": str(int(valid)), "reason": _quoted(words)}
+    numbers |= {"time_s": "%.15g", "valid": str(int(valid)), "reason": _quoted(words)}
     return ",".join(numbers.values()) + "\n"
 
 

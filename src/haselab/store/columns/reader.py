@@ -222,7 +222,8 @@ class ColumnStream(Closing):
         options: what the user states about the columns.
 
     Values come in SI units: `units` has the unit that each column states, or None. `rows` and
-    `rate_hz` are None where the file does not state them; `rows_read` counts on the way.
+    `rate_hz` are None where the file does not state them; `rows_read` counts on the way. `start_s`
+    is the time of the first row, 0 where there are no times.
     Raises:
         InputError: a column is missing, empty, not of numbers; unequal lengths.
     """
@@ -252,6 +253,7 @@ class ColumnStream(Closing):
         self._times: str | None = None
         self.assumed_seconds = ""  # column of times whose unit nobody states
         self._time_factor = 1.0
+        self.start_s = 0.0
         self.rows_read = 0
         try:
             with no_exit():
@@ -293,6 +295,7 @@ class ColumnStream(Closing):
             )
         self.rate_hz = rate_of_times(head * self._time_factor)
         self._times = full if self.rate_hz is not None else None
+        self.start_s = float(head[0]) * self._time_factor if self._times else 0.0
         if self.rate_hz and assumed_seconds(self._archive, full, self._options):
             check_assumed_seconds(full, self.rate_hz, self._archive.file, monitors=True)
             self.assumed_seconds = full
@@ -308,12 +311,14 @@ class ColumnStream(Closing):
         except InputError:
             return  # a column that is only called like one of times
         unit = stated_unit(self._archive, full, self._options)
-        found_hz = rate_of_times(head * (1.0 if unit is None else unit.factor))
+        time_s = head * (1.0 if unit is None else unit.factor)
+        found_hz = rate_of_times(time_s)
         if found_hz and not rates_agree(found_hz, stated_hz, head.size):
             raise InputError(
                 f"The file states a rate of {stated_hz:g} Hz, but column {full} has {found_hz:.6g} "
                 f"rows per second. Remove the wrong one: {self._archive.file}"
             )
+        self.start_s = float(time_s[0]) if found_hz else 0.0
 
     def _empty(self) -> InputError:
         return InputError(f"Column {self._names[0]} is empty. Record again: {self._archive.file}")
@@ -385,7 +390,7 @@ class ColumnStream(Closing):
 
 def check_times(
     path: Path, given_hz: float, options: ColumnOptions, names: Sequence[str] = ()
-) -> None:
+) -> float:
     """Refuse a rate that contradicts the column of times of a file, if it has one.
 
     Args:
@@ -393,12 +398,14 @@ def check_times(
         given_hz: by the user.
         options: what the user states about its columns.
         names: columns that have this rate; times of another table are not theirs.
+    Returns:
+        The time of the first row, in s; 0 if there are no times.
     Raises:
         InputError: they contradict each other.
     """
     head = head_of_times(path, options, _HEAD_ROWS, names)
     if head is None:
-        return
+        return 0.0
     name, time_s = head
     steps = np.diff(time_s)
     # Times with few digits repeat, so they state the rate less exactly.
@@ -409,6 +416,8 @@ def check_times(
             full = time_column(archive, options, beside=archive.locate_all(names)) or name
             assumed = name if assumed_seconds(archive, full, options) else ""
         check_rate(given_hz, nearest, steps.size, f"column {name}", path, assumed=assumed)
+        return float(time_s[0])
+    return 0.0
 
 
 def head_of_times(

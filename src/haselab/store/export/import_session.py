@@ -145,6 +145,7 @@ class Imported:
         largest_rounding_v: largest rounding error of the codes, in V.
         volt_per_monitor_volt: scale of the voltage monitor in the session.
         ampere_per_monitor_volt: scale of the current monitor in the session, in A/V.
+        start_s: time of the first sample in the file; the session counts from 0.
         assumed_seconds: column of times that states no unit and was taken as seconds; empty: none.
     """
 
@@ -155,6 +156,7 @@ class Imported:
     largest_rounding_v: float
     volt_per_monitor_volt: float
     ampere_per_monitor_volt: float
+    start_s: float
     assumed_seconds: str = ""
 
 
@@ -173,8 +175,9 @@ def import_session(file: Path, folder: Path, plan: ImportPlan) -> Imported:
     """
     with _open(file, plan) as stream:
         rate_hz, assumed = plan.rate_hz or stream.rate_hz, stream.assumed_seconds
+        start_s = stream.start_s
     if plan.rate_hz:
-        check_times(file, plan.rate_hz, plan.options, plan.columns)
+        start_s = check_times(file, plan.rate_hz, plan.options, plan.columns)
     if not rate_hz:
         raise InputError(
             "The file states no sampling rate. Add --rate-hz, or name the column of the times with "
@@ -208,8 +211,9 @@ def import_session(file: Path, folder: Path, plan: ImportPlan) -> Imported:
             f"--block-samples, or record for longer. {file}"
         )
     return Imported(
-        blocks, left, rate_hz, scale.volt_per_code, worst_v, volt_per_unit, ampere_per_unit, assumed
-    )
+        blocks, left, rate_hz, scale.volt_per_code, worst_v, volt_per_unit, ampere_per_unit,
+        start_s, assumed,
+    )  # fmt: skip
 
 
 def _open(file: Path, plan: ImportPlan) -> ColumnStream:

@@ -135,6 +135,20 @@ def test_through_the_voltage_map_a_displacement_has_the_model_of_its_strain(
                 "--through-voltage-map", "--actuator", "A.toml", "--json", "--force")  # fmt: skip
         gains.append(json.loads(capsys.readouterr().out)["gain"]["value"])
     assert gains[0] == pytest.approx(gains[1], rel=1e-6)
+    # Without a unit: refused if it cannot be a strain, and a warning if the gain is far from 1.
+    for scale, code, said in (
+        (1e3 * ZERO_M, 2, "Column x reaches"),
+        (ZERO_M, 0, "the static gain is 0.05"),
+        (1.0, 0, ""),
+    ):
+        np.savetxt("R.csv", np.column_stack([time_s, u, scale * strain]), "%.9g", ",",
+                   header="time_s,U,x", comments="")  # fmt: skip
+        with pytest.raises(SystemExit) as stop:
+            main(["identify", "transfer", "R.csv", "--input", "U", "--output", "x",
+                  "--through-voltage-map", "--actuator", "A.toml", "--force"])  # fmt: skip
+        printed = capsys.readouterr()
+        assert stop.value.code == code and said in printed.err
+        assert said or "static gain" not in printed.err
 
 
 def main_ok(*words: str) -> None:

@@ -238,6 +238,8 @@ def read_recorded(
         known = load_actuator(through)
         changed = {names[0]: known.voltage_map().strain(table[names[0]])}
         units = "1", units[1]
+        if units[1] == "":  # the model is to be one from strain to strain
+            check_strain(names[1], table[names[1]], None, file, known)
         if to_strain and units[1] == "m" and known.actuator.geometry.zero_length_m is not None:
             output, stated = names[1], table.units[names[1]]
             changed[output] = strains_of(output, table[output], stated, file, known)

@@ -28,6 +28,7 @@ from haselab.cli.identify.common import (
 )
 from haselab.cli.options import shared_option
 from haselab.cli.plot import save_plot
+from haselab.control.plants.general import PlantScale
 from haselab.identify.nonlinear.nonlinear_fit import NonlinearFit
 from haselab.identify.record import HOLDS, Record
 from haselab.identify.transfer.bootstrap import bootstrap_transfer
@@ -37,6 +38,8 @@ from haselab.identify.transfer.layout import TransferStructure
 from haselab.identify.transfer.nonlinear import NONLINEAR, fit_nonlinear
 from haselab.pipelines.design.sections import MODEL_KEYS, model_section
 from haselab.store.columns.selection import ColumnOptions
+
+_FAR_GAIN = 5.0  # creep and a map of another loop change the gain by less
 
 __all__ = ["transfer"]
 
@@ -193,6 +196,8 @@ def transfer(
             )
         more["bootstrap"] = bootstrap_transfer(fit, options["bootstrap"], rng)
     emit_fit(found, files, as_json, out, more)
+    if options["through_voltage_map"] and fit.succeeded:
+        _warn_of_gain(fit, output, units[1])
     if actuator is not None:
         _save(actuator, fit, (modelled, output), units, files, options["through_voltage_map"])
     save_plot(plot, lambda: fit.chart(axis_names(modelled, output, units)))
@@ -229,6 +234,18 @@ def _agreed(
                 "model needs one quantity. Fit the files separately, or state the unit with --unit."
             )
     return known[0] or new[0], known[1] or new[1]
+
+
+def _warn_of_gain(fit: TransferFit, output: str, unit: str) -> None:
+    """Warn of a static gain far from 1 of a model that should be from strain to strain."""
+    gain = PlantScale.of(fit.plant).gain
+    if unit in ("", "1") and not 1.0 / _FAR_GAIN <= abs(gain) <= _FAR_GAIN:
+        click.echo(
+            f"haselab: warning: the static gain is {gain:.3g}, but about 1 for a model from strain "
+            f"(by the voltage map) to strain. Is column {output} a strain of the same actuator? If "
+            f"it is a displacement, state its unit: --unit '{output}=m', or mm.",
+            err=True,
+        )
 
 
 def _varied(choices: Sequence[str]) -> list[str]:

@@ -203,8 +203,8 @@ def test_an_actuator_file_gives_settings_and_its_drive_limits_them(actuator: Pat
     assert 0.053638 <= design.settings.strain_high <= 0.053738
     assert design.settings.table_v[-1] <= 1.5
     actuator.write_text(text.replace("[drive]", "[drive]\nhigh_v = 0.9"))
-    with pytest.raises(InputError, match=r"voltage map goes from .* to 1\.79.*a\.toml"):
-        read_design(actuator, "pid", FrontEnd())  # zero strain is at 1.04 V
+    with pytest.raises(InputError, match=r"zero strain, which needs 1\.04.*a\.toml"):
+        read_design(actuator, "pid", FrontEnd())
 
 
 def test_a_map_that_reaches_exactly_the_highest_drive_is_used(settings: ChipSettings) -> None:
@@ -220,7 +220,8 @@ def test_a_map_that_reaches_exactly_the_highest_drive_is_used(settings: ChipSett
 @pytest.mark.parametrize(
     ("changes", "match"),
     [
-        ({"drive_high_v": 1.0}, "everywhere within"),
+        ({"drive_high_v": 1.2}, "everywhere within"),
+        ({"drive_high_v": 0.9}, r"zero strain, which needs .* V by the voltage map, but the"),
         ({"drive_high_v": 2.5}, "below the converter's"),
         ({"kp": math.nan}, "must be finite"),
         ({"strain_low": 0.2}, "low end below its high end"),

@@ -95,7 +95,7 @@ def reachable_range(
         raise ResultError(
             f"The voltage map has zero strain at {float(to_volt.voltage_v(0.0)):.3g} V, but the "
             f"drive is limited to [{low_v:g}, {high_v:g}] V. Change the limits of the drive, or "
-            "define zero strain as the length at a drive within these limits, and fit both maps "
-            "and the model again."
+            "define zero strain as the length at a drive within these limits (zero_length_m, with "
+            "a column of lengths), and fit both maps and the model again."
         )
     return Saturation(*found)

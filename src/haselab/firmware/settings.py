@@ -227,6 +227,14 @@ class ChipSettings:
         table = table if self.rises else table[::-1]
         ends_v = table[0] + slack_v, table[-1] - slack_v
         if not (np.diff(table) > 0.0).all() or ends_v[0] < 0.0 or ends_v[1] > self.drive_high_v:
+            zero_v = _core.voltage_from_strain(*self.voltage_map, 0.0)
+            if zero_v > self.drive_high_v:
+                raise InputError(
+                    f"A loop starts at zero strain, which needs {zero_v:.4g} V by the voltage map, "
+                    f"but the microcontroller's output reaches {self.drive_high_v:g} V. Use an "
+                    "amplifier with a higher gain, or define zero strain as the length at a lower "
+                    "drive, and fit maps and model again."
+                )
             raise InputError(
                 f"The voltage map goes from {self.table_v[0]:g} V to {self.table_v[-1]:g} V over "
                 "the saturation, but it must rise, or fall, everywhere within [0, "

@@ -14,7 +14,7 @@ __all__ = ["LinearMap", "VoltageMap", "allow_start", "require_start"]
 Floats = NDArray[np.float64]
 _REACH_POINTS = 1501
 _ITERATIONS = 60
-_NEAR_ZERO = 0.02  # of a strain range's width: largest distance from 0 of an end to start at
+_NEAR_ZERO = 0.05  # of a strain range's width: largest distance from 0 of an end to start at
 
 
 @dataclass(frozen=True)
@@ -181,7 +181,7 @@ def allow_start(strains: tuple[float, float]) -> bool:
     Args:
         strains: lowest and highest strain.
     Returns:
-        True if the range contains 0, or if 0 is outside by at most 2 % of the range's width.
+        True if the range contains 0, or if 0 is outside by at most 5 % of the range's width.
     Example:
         >>> allow_start((-0.03, 0.1)), allow_start((0.0008, 0.08)), allow_start((0.01, 0.08))
         (True, True, False)

@@ -80,7 +80,7 @@ def test_the_page_has_every_section_with_intervals_bands_and_provenance(
     answer = report(capsys, path)
     page_path = tmp_path / "leg-report.html"
     assert answer["report"] == str(page_path)
-    assert list(answer["missing"]) == ["sensing"]  # type: ignore[call-overload]
+    assert list(answer["missing"]) == ["sensing.scale_s"]  # type: ignore[call-overload]
     page = page_path.read_text()
     text = re.sub(r"<svg.*?</svg>|<[^>]+>", " ", page, flags=re.DOTALL)
     text = re.sub(r"\s+", " ", text)

@@ -13,12 +13,55 @@ from numpy.typing import NDArray
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
-__all__ = ["Chart", "Curve", "Panel"]
+__all__ = ["Chart", "Curve", "Panel", "gain_label", "same_unit"]
 
 Array = NDArray[np.float64]
 # By name, because it imports this module; so matplotlib is loaded when one draws.
 _DRAWS = "haselab.report.chart_file"
 Style = Literal["line", "points", "steps", "bars"]
+
+
+def same_unit(quantity: str, axis: str) -> str:
+    """Label of a quantity with the unit of another axis, such as a residual.
+
+    Args:
+        quantity: name of it, without a unit.
+        axis: label whose unit it shares.
+    Example:
+        >>> same_unit("Residual", "y (m)"), same_unit("Residual", "y")
+        ('Residual (m)', 'Residual')
+    """
+    return f"{quantity} ({axis[axis.rindex(' (') + 2 : -1]})" if _has_unit(axis) else quantity
+
+
+def gain_label(quantity: str, source: str, output: str) -> str:
+    """Label of a gain with the unit of output over input, where both axes state their unit.
+
+    Args:
+        quantity: name of it, without a unit.
+        source: label of the input.
+        output: label of the output.
+    Example:
+        >>> gain_label("Magnitude", "u (V)", "y (m)"), gain_label("Magnitude", "u (V)", "strain")
+        ('Magnitude (m/V)', 'Magnitude (1/V)')
+        >>> gain_label("Magnitude", "u", "y (m)")
+        'Magnitude'
+    """
+    units = [_unit(source), _unit(output)]
+    if "" in units or units[0] == units[1]:
+        return quantity
+    return f"{quantity} ({units[1]})" if units[0] == "1" else f"{quantity} ({units[1]}/{units[0]})"
+
+
+def _has_unit(axis: str) -> bool:
+    return axis.endswith(")") and " (" in axis
+
+
+def _unit(axis: str) -> str:
+    """Unit of an axis; "1" of a strain, which has none; empty where it is not known."""
+    if _has_unit(axis):
+        return axis[axis.rindex(" (") + 2 : -1]
+    return "1" if axis.lower().endswith("strain") else ""
 
 
 @dataclass(frozen=True)

@@ -151,6 +151,7 @@ def emit(
     as_json: bool,
     out: Path | None,
     shorter: Mapping[str, Any] | None = None,
+    units: Mapping[str, str] | None = None,
 ) -> None:
     """Print an answer (JSON or readable lines) and, if `out` is given, write its JSON there.
 
@@ -159,6 +160,7 @@ def emit(
         as_json: print JSON.
         out: file of the JSON.
         shorter: what the readable lines have in place of long parts of the answer.
+        units: by name, of numbers whose unit is neither in their name nor in the answer.
     """
     text = json.dumps(to_plain(answer), indent=2)
     if out is not None:
@@ -166,7 +168,7 @@ def emit(
     if as_json:
         click.echo(text)
     else:
-        click.echo("\n".join(readable({**answer, **(shorter or {})})))
+        click.echo("\n".join(readable({**answer, **(shorter or {})}, units)))
 
 
 class _BarProgress:

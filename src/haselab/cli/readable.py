@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 import math
+import textwrap
 from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import replace
 from typing import Any
 
 from haselab.base import Estimate, to_plain
@@ -11,14 +13,19 @@ from haselab.base import Estimate, to_plain
 __all__ = ["readable"]
 
 _NAME_WIDTH, _INDENT, _WIDEST = 32, 2, 100
+_UNIT = "_unit"
 _MOST_NUMBERS = 8  # longest list of numbers that is shown
 
 
-def readable(answer: Mapping[str, Any]) -> list[str]:
+def readable(answer: Mapping[str, Any], units: Mapping[str, str] | None = None) -> list[str]:
     """Format an answer as lines.
+
+    A key `NAME_unit` gives the unit of `NAME`, in the tables within the table too, and has no line
+    of its own. Arrays of one size share a line.
 
     Args:
         answer: numbers, estimates, texts, and tables and lists of them.
+        units: by name, of numbers whose unit is neither in their name nor in the answer.
     Returns:
         Lines of at most about 100 characters, tables indented below their names.
     Example:
@@ -29,41 +36,83 @@ def readable(answer: Mapping[str, Any]) -> list[str]:
           a                              1
           b                              2
     """
-    return list(_lines(answer, 0))
+    return list(_lines(answer, 0, units or {}))
 
 
-def _lines(table: Mapping[str, Any], indent: int) -> Iterator[str]:
+def _lines(table: Mapping[str, Any], indent: int, units: Mapping[str, str]) -> Iterator[str]:
+    stated = {
+        name.removesuffix(_UNIT): unit
+        for name, unit in table.items()
+        if isinstance(unit, str) and name.endswith(_UNIT) and name.removesuffix(_UNIT) in table
+    }
+    units, arrays = {**units, **stated}, _arrays(table)
     for name, value in table.items():
+        if isinstance(name, str) and name.removesuffix(_UNIT) in stated and name.endswith(_UNIT):
+            continue
+        if size := next((size for size, names in arrays.items() if name in names), 0):
+            if name == arrays[size][0]:
+                yield from _array_lines(size, arrays[size], indent)
+            continue
         head = f"{' ' * indent}{name!s:{_NAME_WIDTH - indent}s}"
-        short = _short(value)
+        short = _with_unit(value, _short(value), units.get(name, ""))
         if short is not None and len(short) <= _WIDEST - _NAME_WIDTH:
             yield f"{head} {short}".rstrip()
         elif isinstance(value, Mapping):
             yield head.rstrip()
-            yield from _lines(value, indent + _INDENT)
+            yield from _lines(value, indent + _INDENT, units)
         elif isinstance(value, (list, tuple)):
             yield head.rstrip()
-            yield from _items(value, indent + _INDENT)
+            yield from _items(value, indent + _INDENT, units)
         else:
             yield f"{head} {short}".rstrip()
 
 
-def _items(values: Sequence[Any], indent: int) -> Iterator[str]:
+def _items(values: Sequence[Any], indent: int, units: Mapping[str, str]) -> Iterator[str]:
     """Format each item on its own lines; number the rows of a table."""
     for number, value in enumerate(values, start=1):
         if isinstance(value, Mapping):
             yield f"{' ' * indent}{number}"
-            yield from _lines(value, indent + _INDENT)
+            yield from _lines(value, indent + _INDENT, units)
         else:
             yield f"{' ' * indent}{_short(value) or to_plain(value)}"
+
+
+def _arrays(table: Mapping[str, Any]) -> dict[int, list[str]]:
+    """Names of the arrays that are not shown, by their size."""
+    found: dict[int, list[str]] = {}
+    for name, value in table.items():
+        if _is_long(value):
+            found.setdefault(value.size, []).append(name)
+    return found
+
+
+def _is_long(value: Any) -> bool:
+    return hasattr(value, "shape") and getattr(value, "size", 0) > _MOST_NUMBERS
+
+
+def _array_lines(size: int, names: Sequence[str], indent: int) -> Iterator[str]:
+    what = f"{size} values of each" if len(names) > 1 else f"array of {size} values"
+    head = f"{' ' * indent}{what if len(names) > 1 else names[0]:{_NAME_WIDTH - indent}s}"
+    text = f"{', '.join(names) if len(names) > 1 else what} (use --json or --out)"
+    parts = textwrap.wrap(text, _WIDEST - _NAME_WIDTH)
+    yield from (f"{head if k == 0 else ' ' * _NAME_WIDTH} {part}" for k, part in enumerate(parts))
+
+
+def _with_unit(value: Any, short: str | None, unit: str) -> str | None:
+    """Append a unit to a number, to an estimate without one or to numbers in one line."""
+    if not unit or unit == "1" or short is None or short == "none":
+        return short
+    if isinstance(value, str):
+        return f"{short} ({unit})"
+    if isinstance(value, Estimate):
+        return short if value.unit else _estimate(replace(value, unit=unit))
+    return short if isinstance(value, bool) else f"{short} {unit}"
 
 
 def _short(value: Any) -> str | None:
     """Format a value on one line; None if it needs several."""
     if isinstance(value, Estimate):
         return _estimate(value)
-    if hasattr(value, "shape") and getattr(value, "size", 0) > _MOST_NUMBERS:
-        return f"array of {value.size} values (use --json or --out)"
     if isinstance(value, Mapping):
         return "none" if not value else None
     if isinstance(value, (list, tuple)):

@@ -49,7 +49,12 @@ def loop_chart(
 
 
 def step_chart(
-    plant: AnyPlant, gains: PidGains, setting: LoopSetting, step: float, crossover_rad_s: float
+    plant: AnyPlant,
+    gains: PidGains,
+    setting: LoopSetting,
+    step: float,
+    crossover_rad_s: float,
+    names: tuple[str, str] | None = None,
 ) -> Chart:
     """Predicted step of the closed loop, saturation included, and the open loop.
 
@@ -59,14 +64,16 @@ def step_chart(
         setting: rate, delay and limits.
         step: size of the step, in the unit of the model's output.
         crossover_rad_s: of the open loop, which determines the time and the frequencies shown.
+        names: of the axes of the controller's and the plant's output.
     Returns:
         The chart.
     """
     found = predicted_step(plant, gains, setting, step, 20.0 / max(crossover_rad_s, 1e-3))
     loop = loop_chart(plant, gains, setting, crossover_rad_s)
+    controller, output = names or ("Controller", "Output")
     return Chart("Predicted step, and the open loop with its delay", (
-        Panel("Time (s)", "Output", (Curve(found.time_s, found.measured, "measured by the loop"),
-                                     Curve(found.time_s, found.reference, "reference"))),
-        Panel("Time (s)", "Controller", (Curve(found.time_s, found.u, "", "steps"),)),
+        Panel("Time (s)", output, (Curve(found.time_s, found.measured, "measured by the loop"),
+                                   Curve(found.time_s, found.reference, "reference"))),
+        Panel("Time (s)", controller, (Curve(found.time_s, found.u, "", "steps"),)),
         *loop.panels,
     ), shared_x=False)  # fmt: skip

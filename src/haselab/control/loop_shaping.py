@@ -88,15 +88,19 @@ class Design:
     plant: AnyPlant = field(repr=False)
     plausible: PlausibleMargins | None = None
 
-    def chart(self) -> Chart:
+    def chart(self, names: tuple[str, str] | None = None) -> Chart:
         """Predicted step and open loop of the given plant, as data of a figure.
 
+        Args:
+            names: of the axes of the controller's and the plant's output.
         Returns:
             The chart.
         """
         assert self.spec.step is not None  # of a design that was made
         crossover_rad_s = self.nominal.margins.crossover_rad_s
-        return step_chart(self.plant, self.gains, self.setting, self.spec.step, crossover_rad_s)
+        return step_chart(
+            self.plant, self.gains, self.setting, self.spec.step, crossover_rad_s, names
+        )
 
     def plot(self) -> Figure:
         """Draw the predicted step, and the open loop with its delay.

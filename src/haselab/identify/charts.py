@@ -7,7 +7,7 @@ from collections.abc import Sequence
 import numpy as np
 from numpy.typing import NDArray
 
-from haselab.base.chart import Chart, Curve, Panel
+from haselab.base.chart import Chart, Curve, Panel, same_unit
 from haselab.identify.record import Record
 
 __all__ = [
@@ -40,12 +40,16 @@ def time_chart(
     return Chart(title, (
         Panel("Time (s)", output, (Curve(time_s, measured, "measured", "points"),
                                    Curve(time_s, modelled, model))),
-        Panel("Time (s)", "Residual", (Curve(time_s, measured - modelled, "", "points"),)),
+        Panel("Time (s)", same_unit("Residual", output),
+              (Curve(time_s, measured - modelled, "", "points"),)),
     ))  # fmt: skip
 
 
 def records_chart(
-    title: str, records: Sequence[Record], residuals: Sequence[Floats], output: str
+    title: str,
+    records: Sequence[Record],
+    residuals: Sequence[Floats],
+    names: tuple[str, str] | None,
 ) -> Chart:
     """Records one after the other, with the input, the model and the residuals.
 
@@ -53,10 +57,11 @@ def records_chart(
         title: of the figure.
         records: that were fitted.
         residuals: measured minus modelled, of each. Shape `(M_r,)` each.
-        output: name of the output's axis.
+        names: of the axes of input and output.
     Returns:
         The chart.
     """
+    source, output = names or ("Input", "Output")
     times, inputs, start_s = [], [], 0.0
     for record in records:
         times.append(start_s + record.output_time_s)
@@ -66,7 +71,7 @@ def records_chart(
     measured = np.concatenate([record.y for record in records])
     chart = time_chart(title, time_s, measured, measured - left, (output, "model"))
     u = Curve(np.concatenate(inputs), np.concatenate([r.u for r in records]), "", "steps")
-    return Chart(title, (*chart.panels, Panel("Time (s)", "Input", (u,))))
+    return Chart(title, (*chart.panels, Panel("Time (s)", source, (u,))))
 
 
 def lines_chart(
@@ -135,7 +140,7 @@ def loop_chart(
     u, y, model = (np.concatenate(parts) for parts in zip(*loops, strict=True))
     return Chart(title, (
         Panel(*axes, (Curve(u, y, "measured", "points"), Curve(u, model, "model"))),
-        Panel(axes[0], "Residual", (Curve(u, y - model, "", "points"),)),
+        Panel(axes[0], same_unit("Residual", axes[1]), (Curve(u, y - model, "", "points"),)),
     ))  # fmt: skip
 
 

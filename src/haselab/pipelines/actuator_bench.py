@@ -13,7 +13,26 @@ from haselab.rig.protocols import MonitorCalibration
 from haselab.rig.twin.config import TwinConfig
 from haselab.runtime.lockin import lockin_of
 
-__all__ = ["prepare_bench"]
+__all__ = ["prepare_bench", "refuse_other_kind"]
+
+
+def refuse_other_kind(tables: ActuatorTables, path: Path, twin: TwinConfig) -> None:
+    """Refuse to play the maps and the controller of one kind of actuator on a twin of another.
+
+    Args:
+        tables: of the actuator file.
+        path: of that file.
+        twin: configuration of the twin.
+    Raises:
+        InputError: the file states another kind than that of the twin.
+    """
+    about = tables.actuator
+    if "kind" in about.model_fields_set and about.kind != twin.kind:
+        raise InputError(
+            f"The actuator file is for kind {about.kind!r}, but the twin simulates kind "
+            f"{twin.kind!r}. Use the actuator file of the twin, or a twin of the actuator's kind. "
+            f"{path}"
+        )
 
 
 def prepare_bench(
@@ -37,9 +56,11 @@ def prepare_bench(
     Returns:
         Why the calibration was left out; empty if it is used or there is none.
     Raises:
-        InputError: no voltage is within both limits, or the calibration is for another carrier,
-            sampling rate or amplifier.
+        InputError: no voltage is within both limits, the calibration is for another carrier,
+            sampling rate or amplifier, or the twin is of another kind.
     """
+    if twin is not None:
+        refuse_other_kind(tables, path, twin)
     _limit(rig, tables, path)
     if not tables.sensing.is_calibrated:
         return ""

@@ -36,8 +36,9 @@ _TITLES = {
     "model": "Model",
     "controller": "Controller",
 }
+_KEY = {"sensing": "sensing.scale_s"}  # key that a section lacks; the others are whole tables
 _COMMANDS = {
-    "sensing": "haselab calibrate … --actuator A.toml",
+    "sensing.scale_s": "haselab calibrate … --actuator A.toml (only a real bench needs it)",
     "sensing.strain_map": "haselab identify capacitance-map FILE --actuator A.toml",
     "drive.voltage_map": "haselab identify voltage-map FILE --actuator A.toml",
     "model": "haselab identify transfer FILE --actuator A.toml",
@@ -88,16 +89,16 @@ class _Part:
 
 
 def missing_sections(report: ActuatorReport) -> dict[str, str]:
-    """List sections that the file does not have yet, and the command that writes each.
+    """List what the file does not have yet, and the command that writes each.
 
     Args:
         report: input of the page.
     Returns:
-        Commands by the name of the section.
+        Commands by the name of the section, or of its key.
     """
     tables, controller = report.tables, report.tables.controller
     known = {
-        "sensing": tables.sensing.is_calibrated,
+        "sensing.scale_s": tables.sensing.is_calibrated,
         "sensing.strain_map": tables.sensing.strain_map is not None,
         "drive.voltage_map": tables.drive.voltage_map is not None,
         "model": report.plant is not None,
@@ -124,11 +125,8 @@ def actuator_page(report: ActuatorReport) -> str:
             with figure_style():
                 svg = inline_svg(to_svg(draw_chart(chart), name.replace(".", "-"), chart.title))
         rows = list(_rows_of(report, name))
-        parts.append(
-            _Part(
-                name, title, rows, absent.get(name, ""), report.doubts.get(name, ""), svg, caption
-            )
-        )
+        missing, doubt = absent.get(_KEY.get(name, name), ""), report.doubts.get(name, "")
+        parts.append(_Part(name, title, rows, missing, doubt, svg, caption))
     provenance = dict(_provenance(report.sections.get("provenance")))
     simulated = any(origin.get("simulated") is True for origin in provenance.values())
     about = report.tables.actuator

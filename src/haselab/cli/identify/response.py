@@ -10,15 +10,29 @@ from typing import Any
 import click
 import numpy as np
 
-from haselab.base import InputError, ResultError
+from haselab.base import Estimate, InputError, ResultError
+from haselab.base.chart import gain_label
 from haselab.cli.columns import column_options
 from haselab.cli.common import INTEGER, REAL, answer_options, emit
-from haselab.cli.identify.common import FILES, INPUT, OUTPUT, RATE, emit_fit, rate_hz_of, read_valid
+from haselab.cli.identify.common import (
+    FILES,
+    INPUT,
+    OUTPUT,
+    RATE,
+    axis_names,
+    emit_fit,
+    rate_hz_of,
+    read_valid,
+)
 from haselab.cli.options import shared_option
 from haselab.cli.plot import save_plot
 from haselab.identify.free.response import FreeTrial, fit_free_response
 from haselab.identify.frequency.fit import ResponseFit
-from haselab.identify.frequency.response import RESPONSE_METHODS, estimate_frequency_response
+from haselab.identify.frequency.response import (
+    RESPONSE_METHODS,
+    FrequencyResponse,
+    estimate_frequency_response,
+)
 from haselab.identify.record import Record
 from haselab.identify.transfer.layout import TransferStructure
 from haselab.store.columns.selection import ColumnOptions
@@ -78,11 +92,13 @@ def frequency_response(
         segment_s=choice["segment_s"],
     )
     answer = {"method": choice["method"], **response.answer()}
+    names = axis_names(source, output, tables[0])
     if not choice["fitted"] or not response.succeeded:
-        emit(answer, as_json=as_json, out=out)
+        unit = gain_label("", *names).strip(" ()")
+        emit(answer, as_json=as_json, out=out, shorter=_peak(response, unit))
         if not response.succeeded:
             raise ResultError(f"{response.status}: {' '.join(str(file) for file in files)}")
-        save_plot(plot, response.chart)
+        save_plot(plot, lambda: response.chart(names=names))
         return
     fit = response.fit(TransferStructure(slow_modes=choice["slow_modes"]))
     if as_json or out is not None:
@@ -98,7 +114,21 @@ def frequency_response(
         if _is_plant(fit)
         else None
     )
-    save_plot(plot, lambda: response.chart(fitted))
+    save_plot(plot, lambda: response.chart(fitted, names))
+
+
+def _peak(response: FrequencyResponse, unit: str) -> dict[str, Any]:
+    """Frequency range and highest magnitude, of the lines whose phase is known within 0.5 rad."""
+    hz, size = response.frequency_hz, np.abs(response.response)
+    known = response.succeeded & (hz > 0.0) & (response.magnitude_std < 0.5 * size)
+    if not np.any(known):
+        return {}
+    at = int(np.argmax(np.where(known, size, -np.inf)))
+    return {
+        "range_hz": [float(hz.min()), float(hz.max())],
+        "peak_frequency_hz": float(hz[at]),
+        "peak_magnitude": Estimate.normal(float(size[at]), float(response.magnitude_std[at]), unit),
+    }
 
 
 def _is_plant(fit: ResponseFit) -> bool:

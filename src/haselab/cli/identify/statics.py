@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -31,6 +31,7 @@ from haselab.cli.identify.common import (
 from haselab.cli.options import shared_option
 from haselab.cli.plot import save_plot
 from haselab.identify.statics.capacitance_map import fit_capacitance_map
+from haselab.identify.statics.columns import note_on_voltage
 from haselab.identify.statics.hyperelastic import (
     HyperelasticFit,
     TensileTest,
@@ -40,6 +41,7 @@ from haselab.identify.statics.regions import find_regions
 from haselab.identify.statics.voltage_map import fit_voltage_map
 from haselab.models import DEFORMATIONS, LAWS, Deformation
 from haselab.store.columns.selection import ColumnOptions
+from haselab.store.columns.table import read_table
 
 __all__ = ["capacitance_map", "hyperelastic", "regions", "voltage_map"]
 
@@ -260,10 +262,21 @@ def voltage_map(
         file, {STRAIN: strain_column, VOLTAGE: voltage_column}, columns, known
     )
     fit = fit_voltage_map(strain, voltage_v)
+    if fit.succeeded and (known is None or known.drive.gain_v_per_v is None):
+        name = VOLTAGE.column(file, voltage_column)
+        fit = replace(fit, notes=(*fit.notes, *_voltage_notes(name, voltage_v, file, columns)))
     emit_fit(fit, [file], as_json, out)
     if actuator is not None:
         save_voltage_map(actuator, fit, file)
     save_plot(plot, fit.chart)
+
+
+def _voltage_notes(
+    name: str, voltage_v: Floats, file: Path, columns: ColumnOptions
+) -> tuple[str, ...]:
+    """A note where neither the file nor the name of the column states the unit of the voltage."""
+    notes = () if name.endswith("_v") else note_on_voltage(name, voltage_v)
+    return notes if notes and read_table(file, [name], columns).units[name] is None else ()
 
 
 @click.command("capacitance-map")
@@ -301,6 +314,9 @@ def capacitance_map(
     files = [file] if strain_file is None else [file, strain_file]
     pairs = read_pairs(files, capacitance_column, strain_column, columns, known, experiment)
     fit = fit_capacitance_map(pairs.capacitance, pairs.strain)
+    if pairs.in_farads and "slope" in fit.parameters:
+        slope = replace(fit.parameters["slope"], unit="1/F")
+        fit = replace(fit, parameters={**fit.parameters, "slope": slope})
     more: dict[str, object] = {}
     if actuator is not None and fit.succeeded:
         section = save_strain_map(actuator, pairs, files)

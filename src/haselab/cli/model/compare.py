@@ -18,6 +18,7 @@ from haselab.cli.common import POSITIVE, REAL, SEED, answer_options, emit, unver
 from haselab.cli.identify.common import (
     FILES,
     RATE,
+    axis_names,
     name_files_in_errors,
     read_recorded,
     unit_of_name,
@@ -171,6 +172,7 @@ def command(
             )  # fmt: skip
             _check_units(origin, found.units, (source, output), through_voltage_map)
             records += found.records
+            axes = axis_names(source, output, found.units)
     with name_files_in_errors(*files):
         prediction = predict(
             plant,
@@ -187,7 +189,7 @@ def command(
     emit(_answer(prediction, no_band), as_json=as_json, out=out)
     names = ", ".join(file.name for file in files)
     title = f"Prediction of {names}: {prediction.fit_percent:.1f} %"
-    save_plot(plot, lambda: prediction_chart(prediction, _times(records), title))
+    save_plot(plot, lambda: prediction_chart(prediction, _times(records), title, axes[1]))
     if prediction.status != "ok":
         raise ResultError(f"{prediction.status}. {' '.join(map(str, files))}")
 

@@ -13,6 +13,7 @@ import numpy as np
 from haselab.base import InputError, ResultError
 from haselab.cli.actuator_file import load_actuator, save_section, warn_misspelled_in
 from haselab.cli.common import REAL, SEED, Real, answer_options, emit
+from haselab.cli.identify.common import axis_names
 from haselab.cli.model.loop_options import loop_options
 from haselab.cli.options import shared_option
 from haselab.cli.plot import save_plot
@@ -33,7 +34,12 @@ from haselab.controllers import (
     known_actuator,
 )
 from haselab.models.posterior import PlantPosterior
-from haselab.pipelines.design.answer import design_answer, margins_answer, plausible_sentence
+from haselab.pipelines.design.answer import (
+    design_answer,
+    gain_units,
+    margins_answer,
+    plausible_sentence,
+)
 from haselab.pipelines.design.feedback import default_note, feedback_of, read_controller
 from haselab.pipelines.design.model_file import (
     loop_of,
@@ -163,8 +169,11 @@ def command(
             )
     if remark := design.nominal.step.remark:
         click.echo(f"haselab: warning: {remark}: {model}", err=True)
-    emit(answer, as_json=as_json, out=None)
-    save_plot(plot, design.chart)
+    origin = read_origin(model)
+    ends = origin.input_unit, origin.output_unit
+    emit(answer, as_json=as_json, out=None, units=gain_units(*ends))
+    names = axis_names("Controller output", "Output", ends)
+    save_plot(plot, lambda: design.chart(names))
 
 
 def _own_design(

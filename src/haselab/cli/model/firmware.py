@@ -21,6 +21,7 @@ from haselab.control.reach import default_step
 from haselab.controllers import known_actuator
 from haselab.firmware import CURRENT_SHARE, ChipSettings, FrontEnd
 from haselab.models.plant import Plant
+from haselab.pipelines.actuator_bench import refuse_other_kind
 from haselab.pipelines.design.stated_margins import controller_doubt, drive_doubt, model_doubt
 from haselab.rig.chip import (
     ChipDesign,
@@ -266,6 +267,7 @@ def simulate(
     warn_doubts(run, structure)
     front_end = FrontEnd()
     design = read_design(run, structure, front_end, source)
+    refuse_other_kind(design.tables, run, config)
     _check_current(
         design, front_end, run, "It cannot be simulated with another gain; build it with"
     )

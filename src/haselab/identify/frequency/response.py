@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from scipy.sparse import csr_array
 
 from haselab.base import InputError, JsonObject, checked
-from haselab.base.chart import Chart, Curve, Panel
+from haselab.base.chart import Chart, Curve, Panel, gain_label
 from haselab.identify.fit import several
 from haselab.identify.frequency.charts import BodeChart, NicholsChart, NyquistChart
 from haselab.identify.frequency.clipping import clipped_at
@@ -104,11 +104,12 @@ class FrequencyResponse:
         """Magnitude in dB over phase in degrees, with 95 % intervals."""
         return NicholsChart.of(self.frequency_hz, self.response, self.std)
 
-    def chart(self, fitted: Complexes | None = None) -> Chart:
+    def chart(self, fitted: Complexes | None = None, names: tuple[str, str] | None = None) -> Chart:
         """Magnitude, phase and coherence over the frequency as data of a figure.
 
         Args:
             fitted: response of a model at the same frequencies. Shape `(K,)`.
+            names: of the axes of input and output, for the unit of the magnitude.
         Returns:
             The chart; without the line at 0 Hz, which a logarithmic axis does not have.
         """
@@ -124,8 +125,9 @@ class FrequencyResponse:
         if fitted is not None:
             sizes.append(Curve(hz, np.abs(fitted[used]), "fit"))
             phases.append(Curve(hz, degrees(fitted)))
+        magnitude = gain_label("Magnitude", *(names or ("", "")))
         return Chart("Frequency response" if fitted is None else "Frequency response and fit", (
-            Panel(axis, "Magnitude", sizes, log_x=True, log_y=True),
+            Panel(axis, magnitude, sizes, log_x=True, log_y=True),
             Panel(axis, "Phase (°)", phases, log_x=True),
             Panel(axis, "Coherence", (Curve(hz, self.coherence[used]),), log_x=True),
         ))  # fmt: skip

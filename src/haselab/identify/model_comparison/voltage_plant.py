@@ -184,8 +184,7 @@ class VoltagePlantFit(RecordFit[Record]):
     def chart(self, names: tuple[str, str] | None = None) -> Chart:
         """See `Fit`."""
         self._require()
-        output = (names or ("", "Output"))[1]
-        return records_chart("Voltage plant", self.records, self.residuals, output)
+        return records_chart("Voltage plant", self.records, self.residuals, names)
 
     def answer(self) -> JsonObject:
         """The result under its public JSON keys."""

@@ -10,6 +10,7 @@ from haselab.identify.record import finite_vector
 
 __all__ = [
     "check_pair",
+    "note_on_voltage",
     "plausible_capacitance",
     "plausible_strain",
     "plausible_stretch",
@@ -130,13 +131,11 @@ def plausible_capacitance(name: str, capacitance_f: Floats) -> None:
         )
 
 
-def plausible_voltage(voltage_v: Floats) -> tuple[str, ...]:
-    """Refuse implausible voltages; return a note for those that may have another unit.
+def plausible_voltage(voltage_v: Floats) -> None:
+    """Refuse implausible voltages.
 
     Args:
         voltage_v: column of voltages. Shape `(N,)`.
-    Returns:
-        A note, or nothing.
     Raises:
         InputError: a voltage above 100 kV.
     """
@@ -146,9 +145,21 @@ def plausible_voltage(voltage_v: Floats) -> tuple[str, ...]:
             f"voltage_v reaches {size:g} V; it must be at most {_HIGHEST_V:g} V. "
             "Give volts, or name the right column."
         )
-    if size < _KILOVOLTS_V:
-        return (
-            f"The voltage reaches {size:.3g} V only and is taken as the drive ahead of the "
-            "amplifier. If its unit is not V, state the unit.",
-        )
-    return ()
+
+
+def note_on_voltage(name: str, voltage_v: Floats) -> tuple[str, ...]:
+    """Return a note where voltages without a unit may be kilovolts.
+
+    Args:
+        name: of the column.
+        voltage_v: its values. Shape `(N,)`.
+    Returns:
+        A note, or nothing.
+    """
+    size = float(np.abs(voltage_v).max())
+    if size >= _KILOVOLTS_V:
+        return ()
+    return (
+        f"Column {name} states no unit and reaches {size:.3g} only. It is taken as the drive ahead "
+        f"of the amplifier, in V. If it is in kV, add --unit '{name}=kV'.",
+    )

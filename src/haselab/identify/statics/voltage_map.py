@@ -206,7 +206,7 @@ def fit_voltage_map(strain: ArrayLike, voltage_v: ArrayLike) -> VoltageMapFit:
         >>> fit.status, low < -26.92 < high
         ('ok', True)
     """
-    e, v, units = _checked(strain, voltage_v)
+    e, v, doubts = _checked(strain, voltage_v)
     middle, half = 0.5 * float(e.max() + e.min()), 0.5 * float(np.ptp(e))
     x = (e - middle) / half
     sign = trend(x, v)
@@ -223,15 +223,16 @@ def fit_voltage_map(strain: ArrayLike, voltage_v: ArrayLike) -> VoltageMapFit:
     covariance = coloured_covariance(solution.columns, solution.residuals, 4)
     numbers = np.concatenate([solution.search, solution.shared])
     fit = _describe(e, v, _Curve(middle, half, numbers, covariance), solution, limited)
-    return replace(fit, notes=(*fit.notes, *units))
+    return replace(fit, notes=(*fit.notes, *doubts))
 
 
 def _checked(strain: ArrayLike, voltage_v: ArrayLike) -> tuple[Floats, Floats, tuple[str, ...]]:
-    """Check both columns; return a note where the voltage may be in kilovolts."""
+    """Check both columns; return a note where the strain may be in per cent."""
     e, v = check_pair(
         "strain", strain, "voltage_v", voltage_v, least=8, record="record a triangle test"
     )
-    return e, v, (*plausible_strain(e, "voltage_v", v), *plausible_voltage(v))
+    plausible_voltage(v)
+    return e, v, plausible_strain(e, "voltage_v", v)
 
 
 def _describe(

@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from haselab.base import InputError
-from haselab.base.chart import Curve, Panel
+from haselab.base.chart import Curve, Panel, gain_label
 from haselab.identify.frequency.response import estimate_frequency_response
 from haselab.identify.record import Record
 from haselab.models.posterior import PlantPosterior
@@ -23,7 +23,10 @@ _MOST_POINTS = 20000  # samples of the records; more would make the figure slow
 
 
 def bode_panels(
-    model: RationalModel, posterior: PlantPosterior | None, records: Sequence[Record]
+    model: RationalModel,
+    posterior: PlantPosterior | None,
+    records: Sequence[Record],
+    names: tuple[str, str] | None = None,
 ) -> tuple[Panel, Panel]:
     """Magnitude and phase of a model, with its band of 95 % and the records' frequency response.
 
@@ -33,6 +36,7 @@ def bode_panels(
         records: that were fitted. Their frequency response is drawn if it can be estimated: input
             and output have the same times, the input varies enough, and there are at most 20,000
             samples.
+        names: of the axes of input and output, for the unit of the magnitude.
     Returns:
         The panel of the magnitude and that of the phase.
     """
@@ -42,6 +46,7 @@ def bode_panels(
     response = model.frequency_response(2.0 * np.pi * frequency_hz)
     size_std, turn_std = _deviations(posterior, frequency_hz, response)
     phase = np.unwrap(np.angle(response))
+    size = gain_label("Magnitude", *(names or ("", "")))
     sizes, phases, measured = [], [], _measured(records)
     if measured is not None:
         hz, lines = measured
@@ -52,7 +57,7 @@ def bode_panels(
     sizes.append(Curve(frequency_hz, np.abs(response), "model, 95 %", std=size_std))
     phases.append(Curve(frequency_hz, np.degrees(phase), std=turn_std))
     return (
-        Panel("Frequency (Hz)", "Magnitude", sizes, log_x=True, log_y=True),
+        Panel("Frequency (Hz)", size, sizes, log_x=True, log_y=True),
         Panel("Frequency (Hz)", "Phase (°)", phases, log_x=True),
     )
 

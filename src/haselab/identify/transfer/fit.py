@@ -243,13 +243,12 @@ class TransferFit(RecordFit[Record]):
         """See `Fit`."""
         self._present(self.records or None)
         title = f"Transfer function, fit {self.fit_percent:.1f} %"
-        output = (names or ("", "Output"))[1]
-        chart = records_chart(title, self.records, self.residuals, output)
+        chart = records_chart(title, self.records, self.residuals, names)
         try:
             model = self.rational
         except ResultError:  # a parameter is not identifiable
             return chart
-        bode = bode_panels(model, self._spread, self.records)
+        bode = bode_panels(model, self._spread, self.records, names)
         return Chart(title, (*chart.panels, *bode), shared_x=False)
 
     def answer(self) -> JsonObject:

@@ -6,7 +6,9 @@ import base64
 import io
 import math
 import shlex
-from collections.abc import Callable, Mapping
+import threading
+from collections.abc import Callable, Hashable, Mapping
+from concurrent.futures import Future, wait
 from dataclasses import dataclass
 from functools import lru_cache
 from pathlib import Path
@@ -34,6 +36,8 @@ _MOST_VIDEOS = 2000
 _MOST_POINTS = 5000
 _ALL_DOTS = 1 << 30
 _LONGEST_NAME = 200
+_MOST_SEARCHES = 4  # whose results are kept
+_LOOK_S = 0.1  # between two looks whether the program ends
 _LARGE = 1.4  # times the particles' standard deviation: a large dot
 _LARGE_REACH_PX = 6.0  # a large dot is chosen before a particle that is nearer by less than this
 T = TypeVar("T")
@@ -155,15 +159,59 @@ def _frame(path: Path, stamp: tuple[int, int], number: int) -> tuple[Frame, int,
         return frame, video.frame_count, time_s
 
 
-@lru_cache(maxsize=4)
+class _Searches:
+    """Long searches: equal requests share one, and the program may end while one runs."""
+
+    def __init__(self) -> None:
+        self._lock = threading.Lock()
+        self._known: dict[Hashable, Future[Any]] = {}
+
+    def result(self, key: Hashable, search: Callable[[], T]) -> T:
+        """The result of a search, which is made once for each key.
+
+        The search is in a daemon thread, and its request does not outlive the main thread, so that
+        neither keeps the program from ending.
+
+        Raises:
+            ResultError: the program ends.
+        """
+        with self._lock:
+            found = self._known.pop(key, None)
+            if found is None or (found.done() and found.exception() is not None):
+                found = Future()
+                threading.Thread(target=self._run, args=(found, search), daemon=True).start()
+            self._known[key] = found
+            while len(self._known) > _MOST_SEARCHES:
+                self._known.pop(next(iter(self._known)))
+        while not wait([found], _LOOK_S).done:
+            if not threading.main_thread().is_alive():
+                raise ResultError("The program has ended.")
+        result: T = found.result()
+        return result
+
+    @staticmethod
+    def _run(found: Future[T], search: Callable[[], T]) -> None:
+        try:
+            found.set_result(search())
+        except BaseException as error:
+            found.set_exception(error)
+
+
+_SEARCHES = _Searches()
+
+
 def _dots(path: Path, stamp: tuple[int, int], number: int) -> tuple[Points, DotProfile]:
     """All dots of a frame, as `haselab track --auto` finds them, and the profile of particles."""
-    frame = _frame(path, stamp, number)[0]
-    profile = find_profile(frame)
-    try:
-        return find_points(frame, _ALL_DOTS, None), profile
-    except ResultError:
-        return Points([], np.zeros((0, 2)), 0), profile
+
+    def search() -> tuple[Points, DotProfile]:
+        frame = _frame(path, stamp, number)[0]
+        profile = find_profile(frame)
+        try:
+            return find_points(frame, _ALL_DOTS, None, profile), profile
+        except ResultError:
+            return Points([], np.zeros((0, 2)), 0), profile
+
+    return _SEARCHES.result((path, stamp, number), search)
 
 
 def _large_dot(
@@ -264,7 +312,8 @@ def _region(videos: Videos, values: JsonObject) -> JsonObject:
             "16 x 16 px inside the picture."
         )
     part = frame[low[1] : high[1] + 1, low[0] : high[0] + 1]
-    found = find_points(part, count, None)
+    key = (path, stamp, number, *low.tolist(), *high.tolist(), count)
+    found = _SEARCHES.result(key, lambda: find_points(part, count, None))
     places = (found.place_px + low).tolist()
     return {
         "points": [[name, *place] for name, place in zip(found.names, places, strict=True)],

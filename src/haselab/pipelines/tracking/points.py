@@ -15,6 +15,7 @@ from numpy.typing import NDArray
 from haselab.base import InputError, ResultError
 from haselab.store.text_file import read_text
 from haselab.tracking import (
+    DotProfile,
     PointTracker,
     TrackOptions,
     TrackState,
@@ -225,18 +226,21 @@ def _clamp_dots(image: Frame) -> tuple[list[str], Floats]:
     return [f"{row}{k}" for row in ("upper", "lower") for k in (1, 2, 3)], place
 
 
-def find_points(image: Frame, count: int, subset_px: int | None) -> Points:
+def find_points(
+    image: Frame, count: int, subset_px: int | None, profile: DotProfile | None = None
+) -> Points:
     """Find particles, well spread over the image, and the clamp dots if there are any.
 
     Args:
         image: the first frame.
         count: maximum number of particles.
         subset_px: side of a subset, in px; `None`: chosen from the size of the dots.
+        profile: of the particles, as `find_profile` finds it; `None`: it is searched.
 
     Raises:
         ResultError: nothing exceeds the noise.
     """
-    profile = find_profile(image)
+    profile = find_profile(image) if profile is None else profile
     names, clamps = _clamp_dots(image)
     gauge = ""
     why = [

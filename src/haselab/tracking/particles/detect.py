@@ -2,13 +2,14 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterable, Iterator
 from dataclasses import dataclass
-from typing import Literal
+from typing import Literal, TypeVar
 
 import numpy as np
 from numpy.lib.stride_tricks import sliding_window_view
 from numpy.typing import NDArray
-from scipy.fft import dctn, idctn
+from scipy.fft import dctn, idct
 from scipy.ndimage import gaussian_laplace, map_coordinates
 from scipy.spatial import cKDTree
 
@@ -28,6 +29,7 @@ __all__ = [
 ]
 
 Polarity = Literal["dark", "bright"]
+T = TypeVar("T")
 
 _PARTICLE_SIGMAS_PX = (1.0, 1.4, 2.0, 2.8, 4.0, 5.6)
 _STRONGEST = 50  # strongest dots, used to choose the scale
@@ -43,6 +45,7 @@ _AROUND_PX = 48  # seen around a place: to 4.5 standard deviations of a dot of 1
 _LEAST_COMPARED = 12  # dots that show how uneven the ground usually is
 _UNEVEN_TIMES = 5.0  # step of the ground that is an edge, relative to the most even quarter's
 _UNEVEN_DEPTH = 0.5  # and relative to the depth of a dot
+_NO_CONTENT = 40.0  # exponent beyond which a frequency is lost in rounding (e^-40 = 4e-18)
 _EVEN = 0.2  # largest unevenness around a fiducial, relative to its depth
 
 
@@ -78,12 +81,14 @@ def _peaks(
     least = _NOISE_FACTOR * noise / (np.sqrt(2.0 * np.pi) * sigma_px)
     edge = max(1, margin_px)
     inner = response[edge:-edge, edge:-edge]
-    height, width = inner.shape
-    highest = inner > least
+    along = response[edge:-edge]  # these two leave few pixels for the other neighbours
+    highest = (inner > least) & (inner >= along[:, edge - 1 : -edge - 1])
+    highest &= inner >= along[:, edge + 1 : response.shape[1] - edge + 1]
+    y, x = (index + edge for index in np.nonzero(highest))
     for down, right in _NEIGHBOURS:
-        top, left = edge + down, edge + right
-        highest &= inner >= response[top : top + height, left : left + width]
-    found: NDArray[np.intp] = np.argwhere(highest) + edge
+        highest = response[y, x] >= response[y + down, x + right]
+        y, x = y[highest], x[highest]
+    found: NDArray[np.intp] = np.stack([y, x], axis=1)
     radius = max(1, round(radius_px))
     around = sliding_window_view(
         np.pad(response, radius, constant_values=-np.inf), (2 * radius + 1,) * 2
@@ -158,9 +163,10 @@ def find_profile(image: NDArray[np.generic], polarity: Polarity | None = None) -
     noise = _pixel_noise(grey)
     signs: tuple[Polarity, ...] = ("dark", "bright") if polarity is None else (polarity,)
     scores = {}
-    for sign in signs:
-        for sigma in _PARTICLE_SIGMAS_PX:
-            response = _response(grey, sigma, sign)
+    for sigma in _PARTICLE_SIGMAS_PX:
+        dark = _response(grey, sigma, "dark")
+        for sign in signs:
+            response = dark if sign == "dark" else -dark
             peaks = _peaks(response, sigma, noise, sigma, round(3 * sigma))[:_STRONGEST]
             compact = _paraboloids(response, peaks)[2] > _LEAST_COMPACT
             strength = response[peaks[:, 0], peaks[:, 1]][compact]
@@ -287,9 +293,10 @@ def detect_particles(
         >>> detect_particles(image).round(1)
         array([[30.3, 19.8]])
     """
-    profile = find_profile(image, polarity)
-    if sigma_px is not None:
-        profile = DotProfile(float(sigma_px), profile.polarity)
+    if sigma_px is None or polarity is None:
+        profile = find_profile(image, polarity)
+        sigma_px, polarity = sigma_px or profile.sigma_px, profile.polarity
+    profile = DotProfile(float(sigma_px), polarity)
     found = locate_particles(image, profile, margin_px=margin_px)
     points, strength = found.points_px, found.strength
     if subset_px is not None:
@@ -329,7 +336,7 @@ def _is_even_around(
     return np.asarray(unequal <= max(_UNEVEN_TIMES * usual, _UNEVEN_DEPTH * depth))
 
 
-def _scale_space(image: Floats, polarity: str) -> list[tuple[float, Floats]]:
+def _scale_space(image: Floats, polarity: str) -> Iterator[tuple[float, Floats]]:
     """Responses from sigma 2 px to a sixteenth of the shorter side, in eighths of an octave."""
     largest = max(3.0, min(image.shape) / 16.0)
     steps = int(np.ceil(4 * np.log2(largest / 2.0))) + 1
@@ -338,26 +345,37 @@ def _scale_space(image: Floats, polarity: str) -> list[tuple[float, Floats]]:
     down, across = ((np.pi * np.arange(size) / size) ** 2 for size in image.shape)
     content = dctn(image, norm="ortho") * -(down[:, None] + across) * sign
 
-    def response(sigma: float) -> Floats:
+    for sigma in 2.0 * 2.0 ** (np.arange(steps) / 4.0):
         half = 0.5 * sigma**2
-        smooth = sigma**2 * np.exp(-half * down)[:, None] * np.exp(-half * across)
-        return np.asarray(idctn(content * smooth, norm="ortho"))
+        rows, columns = (int(np.sum(half * each < _NO_CONTENT)) for each in (down, across))
+        smooth = sigma**2 * np.exp(-half * down[:rows])[:, None] * np.exp(-half * across[:columns])
+        lines = idct(content[:rows, :columns] * smooth, n=image.shape[1], axis=1, norm="ortho")
+        yield float(sigma), np.asarray(idct(lines, n=image.shape[0], axis=0, norm="ortho"))
 
-    return [(float(sigma), response(sigma)) for sigma in 2.0 * 2.0 ** (np.arange(steps) / 4.0)]
+
+def _with_neighbours(levels: Iterable[T]) -> Iterator[tuple[T | None, T, T | None]]:
+    """Each level with the ones before and after it; only three are in memory."""
+    below, here = None, None
+    for above in levels:
+        if here is not None:
+            yield below, here, above
+        below, here = here, above
+    if here is not None:
+        yield below, here, None
 
 
 def _candidates(image: Floats, polarity: str) -> tuple[Floats, Floats, Floats]:
     """Round dots at their own scale: centres, sigmas, responses, with overlapping ones merged."""
-    space, noise = _scale_space(image, polarity), _pixel_noise(image)
+    noise = _pixel_noise(image)
     points, sigmas, strengths = [], [], []
-    for level, (sigma, response) in enumerate(space):
+    for below, (sigma, response), above in _with_neighbours(_scale_space(image, polarity)):
         peaks = _peaks(response, sigma, noise, sigma, round(2 * sigma))[:200]
         shift, _, roundness = _paraboloids(response, peaks)
         y, x = peaks.T
         best = np.ones(len(peaks), bool)
-        for other in (level - 1, level + 1):
-            if 0 <= other < len(space):
-                best &= response[y, x] >= space[other][1][y, x]
+        for other in (below, above):
+            if other is not None:
+                best &= response[y, x] >= other[1][y, x]
         best &= roundness > _LEAST_ROUND
         points.append((peaks[:, ::-1] + shift)[best])
         sigmas.append(np.full(int(best.sum()), sigma))

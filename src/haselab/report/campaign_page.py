@@ -199,7 +199,7 @@ def _tables(summary: Mapping[str, Any]) -> Iterator[_Table]:
         "difference is from resampling both; without draws there is none. Cases without a value "
         "are left out, and so are results whose median was not reached. If both campaigns have the "
         "same cases, only those with a value in both count. "
-        f"{_differences(summary.get('differs_in', ()))}",
+        f"{_differences(summary)}",
         ("Result", "Median here", "Median there", "Difference", "Without a value, here and there"),
         [
             (
@@ -215,7 +215,7 @@ def _tables(summary: Mapping[str, Any]) -> Iterator[_Table]:
         f"This campaign minus that in {summary.get('compared_with', '')}. A case has the same "
         "drawn values and random numbers in both, so differences between the devices cancel. "
         "Cases without a finite value in both are left out. "
-        f"{_differences(summary.get('differs_in', ()))}",
+        f"{_differences(summary)}",
         ("Result", "Cases", "Left out", "Smallest difference", "Median difference",
          "Largest difference"),
         [
@@ -347,7 +347,13 @@ def _figures_over(found: Sequence[Mapping[str, Any]]) -> Iterator[str]:
                 yield inline_svg(to_svg(draw_chart(chart), f"axis-{number}", one["result"]))
 
 
-def _differences(changes: Sequence[str]) -> str:
+def _differences(summary: Mapping[str, Any]) -> str:
+    """In what the two campaigns differ."""
+    doubts = [f" About the other campaign: {doubt}." for doubt in summary.get("doubts", ())]
+    return _changed_values(summary.get("differs_in", ())) + "".join(doubts)
+
+
+def _changed_values(changes: Sequence[str]) -> str:
     if not changes:
         return "The two campaign files are equal."
     more = len(changes) - _MOST_CHANGES

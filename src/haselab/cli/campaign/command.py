@@ -18,10 +18,12 @@ from haselab.campaign.executors.processes import ProcessExecutor
 from haselab.campaign.folder import (
     changes_of,
     described_in,
+    doubts_about,
     finished_rows,
     open_folder,
     plan_of,
     read_results,
+    table_checksum,
     write_table,
 )
 from haselab.campaign.plan import Plan, Problem
@@ -103,6 +105,7 @@ def command(
         raise click.UsageError("Missing option '--out': the folder of the campaign.")
     plan = plan_of(load_campaign(campaign), out)
     there = None if other is None else (read_results(other), described_in(other))
+    doubts = [] if other is None else doubts_about(other, plan.code)
     open_folder(plan, out)
     count = workers or os.cpu_count() or 1
 
@@ -126,7 +129,7 @@ def command(
 
         rows = finished_rows(plan, out)
         write_table(plan, rows, out)
-        summary = summarised(plan, rows)
+        summary = summarised(plan, rows) | {"table_crc32": table_checksum(out)}
         for path in cast("list[str]", summary["without_effect"]):
             click.echo(
                 f"haselab: warning: no result depends on {path}; the kind "
@@ -145,9 +148,11 @@ def command(
                     f"haselab: No comparison: no result has at least {LEAST_CASES} values and a "
                     f"finite median in both campaigns. {other}", err=True,
                 )  # fmt: skip
+            for doubt in doubts:
+                click.echo(f"haselab: warning: the campaign in {other}: {doubt}", err=True)
             summary |= {
                 "comparison": comparison, "paired": pairs, "compared_with": str(other),
-                "differs_in": changes_of(there[1], plan.campaign.described()),
+                "doubts": doubts, "differs_in": changes_of(there[1], plan.campaign.described()),
             }  # fmt: skip
         write_text(out / "report.html", campaign_page(summary, _values(plan, rows)))
         answer["summary"] = summary

@@ -284,8 +284,11 @@ class StrainSimulation:
 def _pool(devices: int | Sequence[Device | TwinConfig], seed: int) -> _Pool:
     listed = [_device(one) for one in _listed(devices, seed)]
     if ignored := [name for name in _ignorable() if any(_changes(one, name) for one in listed)]:
-        warnings.warn(f"The environments ignore {', '.join(ignored)} of the devices, so these values "
-                      "have no effect.", stacklevel=2)  # fmt: skip
+        named = ", ".join(ignored)
+        warnings.warn(
+            f"The environments ignore {named} of the devices, so these values have no effect.",
+            stacklevel=2,
+        )
     switch_at = tuple(_switch_at(one, number) for number, one in enumerate(listed))
     settled = [_settled(one, number) for number, one in enumerate(listed)]
     low_v, high_v = (np.array([getattr(one, end) for one in listed]) for end in ("low_v", "high_v"))

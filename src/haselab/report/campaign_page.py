@@ -84,6 +84,11 @@ def _about(summary: Mapping[str, Any]) -> str:
         parts.append(
             f"The sensitivities leave out {', '.join(unranked)}, whose values are no numbers."
         )
+    if exact := summary.get("without_noise", ()):
+        parts.append(
+            f"There is no coverage of {', '.join(exact)}: the cases have no noise, so their "
+            "intervals are only as wide as rounding errors."
+        )
     if summary["is_random"] and not summary["sensitivities"]:
         parts.append("There are no sensitivities: too few cases have a value, or none changes.")
     return " ".join(parts)
@@ -154,6 +159,7 @@ def _tables(summary: Mapping[str, Any]) -> Iterator[_Table]:
             )
         ] or [(ABSENT, ABSENT, "repeats only")],
     )  # fmt: skip
+    yield from _sensitivities(summary["sensitivities"])
     yield _Table(
         "Results", "Numbers in brackets are intervals of 95 %.",
         ("Result", "Axes", "Cases", "Without a value", "Smallest", "5 %", "Median", "95 %",
@@ -180,7 +186,6 @@ def _tables(summary: Mapping[str, Any]) -> Iterator[_Table]:
     )  # fmt: skip
     yield from _over(summary["over_axes"])
     yield from _along(summary["axis_differences"])
-    yield from _sensitivities(summary["sensitivities"])
     yield _Table(
         "Failed cases",
         "Errors, the most frequent first, with the first case of each. Errors that differ only in "
@@ -411,7 +416,9 @@ def _with_interval(number: Mapping[str, Any] | None) -> str:
 
 
 def _text(value: float | None) -> str:
-    return "not reached" if value == math.inf else number_text(value)
+    if value is not None and math.isinf(value):
+        return "not reached" if value > 0.0 else "−infinite"
+    return number_text(value)
 
 
 def _shown(value: object) -> str:

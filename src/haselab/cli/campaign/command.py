@@ -26,18 +26,18 @@ from haselab.campaign.folder import (
     table_checksum,
     write_table,
 )
+from haselab.campaign.groups import LEAST_CASES, groups_of, result_names
 from haselab.campaign.plan import Plan, Problem
 from haselab.campaign.run import Progressed, run_cases
 from haselab.campaign.summary import (
-    LEAST_CASES,
     compared,
     draws_are_independent,
-    groups_of,
     is_random,
+    most_important,
     paired,
-    result_names,
     share_cases,
     summarised,
+    with_infinities,
 )
 from haselab.campaign.work import compute_case
 from haselab.cli.common import WORKERS, answer_options, progress_bar
@@ -123,7 +123,7 @@ def command(
             f"haselab: {found.outdated:,} finished cases in {out} are of another version of "
             "haselab and were not used", err=True,
         )  # fmt: skip
-    answer = _answer(found)
+    answer, important = _answer(found), ""
     if found.is_complete:
         from haselab.report.campaign_page import campaign_page  # matplotlib is slow to import
 
@@ -155,9 +155,11 @@ def command(
                 "doubts": doubts, "differs_in": changes_of(there[1], plan.campaign.described()),
             }  # fmt: skip
         write_text(out / "report.html", campaign_page(summary, _values(plan, rows)))
-        answer["summary"] = summary
-        write_json(out / "summary.json", summary)
-    click.echo(json.dumps(to_plain(answer), indent=2) if as_json else "\n".join(_lines(found, out)))
+        answer["summary"] = with_infinities(summary)
+        write_json(out / "summary.json", answer["summary"])
+        important = most_important(summary, rows)
+    lines = _lines(found, out, important)
+    click.echo(json.dumps(to_plain(answer), indent=2) if as_json else "\n".join(lines))
     if found.is_complete and found.failed == found.cases:
         raise ResultError(f"All {found.cases:,} cases failed. See {out / 'failed.txt'}.")
 
@@ -174,8 +176,10 @@ def _compute_one(plan: Plan, index: int, *, as_json: bool) -> None:
         click.echo(row.traceback.rstrip(), err=True)
         raise ResultError(f"Case {index} failed: {row.error}")
     if as_json:
-        found = {"index": index, "parameters": dict(row.values), "results": dict(row.results)}
-        click.echo(json.dumps(to_plain(found), indent=2))
+        found: JsonObject = {
+            "index": index, "parameters": dict(row.values), "results": dict(row.results),
+        }  # fmt: skip
+        click.echo(json.dumps(to_plain(with_infinities(found)), indent=2))
         return
     for name, value in {**row.values, **row.results}.items():
         click.echo(f"{name} = {value:.6g}" if isinstance(value, float) else f"{name} = {value}")
@@ -201,7 +205,7 @@ def _answer(found: Progressed) -> JsonObject:
     }
 
 
-def _lines(found: Progressed, out: Path) -> list[str]:
+def _lines(found: Progressed, out: Path, important: str) -> list[str]:
     lines = [f"{found.done:,} of {found.cases:,} cases have a result, {found.failed:,} failed"]
     if found.computed:
         workers = "1 worker" if found.workers == 1 else f"{found.workers} workers"
@@ -211,4 +215,6 @@ def _lines(found: Progressed, out: Path) -> list[str]:
         )
     if found.elsewhere:
         lines.append(f"{found.elsewhere:,} are being computed by another program")
+    if important:
+        lines.append(important)
     return [*lines, f"written to {out}"]

@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import json
 import math
+import re
 import sys
 from dataclasses import replace
 from pathlib import Path
@@ -13,16 +15,19 @@ import pytest
 
 from haselab.base import InputError
 from haselab.campaign.definition import Distribution
-from haselab.campaign.folder import TABLE, read_results
+from haselab.campaign.folder import TABLE, finished_rows, read_results
+from haselab.campaign.groups import groups_of
 from haselab.campaign.summary import (
     compared,
     draws_are_independent,
-    groups_of,
     median_interval,
+    most_important,
     summarised,
+    with_infinities,
 )
 from haselab.report.campaign_page import campaign_page
 from haselab.store.campaign.shards import CaseRow
+from haselab.store.folder import json_text
 
 DESIGN = """
 name = "a"
@@ -102,6 +107,87 @@ def test_a_choice_of_numbers_has_a_rank_and_one_of_texts_is_named(campaigns: Any
         "case.natural_frequency_rad_s"
     ]
     assert "leave out case.gain, whose values are no numbers" in campaign_page(summary, {})
+
+
+@pytest.mark.parametrize("factor", [1e200, 1e-200, 1e307, 1.0])
+def test_sobol_indices_do_not_depend_on_the_unit_of_the_result(
+    campaigns: Any, factor: float
+) -> None:
+    """Scaled by a power of two, so the indices are the same up to the rounding of the factor."""
+    plan = campaigns.plan(DESIGN.format("saltelli", 64))
+    rows = campaigns.rows_of(plan, lambda gain, omega: factor * (3.0 * gain + omega))
+    own = campaigns.rows_of(plan, lambda gain, omega: 3.0 * gain + omega)
+    found, expected = (summarised(plan, part)["sensitivities"] for part in (rows, own))
+    for one, other in zip(found, expected, strict=True):
+        for index in ("first", "total"):
+            assert one[index]["value"] == pytest.approx(other[index]["value"], abs=1e-12)
+            assert one[index]["ci95"] == pytest.approx(other[index]["ci95"], abs=1e-12)
+    assert math.isfinite(summarised(plan, rows)["distributions"][0]["mean"])
+
+
+def test_a_rank_correlation_lies_in_its_interval_and_a_constant_parameter_has_none(
+    campaigns: Any,
+) -> None:
+    plan = campaigns.plan(DESIGN.format("random", 40))
+    for sign in (1.0, -1.0):
+        rows = campaigns.rows_of(plan, lambda gain, omega, sign=sign: sign * gain**3)
+        rows = [
+            replace(row, values={**row.values, "case.natural_frequency_rad_s": 1.5}) for row in rows
+        ]
+        found = {one["parameter"]: one["correlation"] for one in
+                 summarised(plan, rows)["sensitivities"]}  # fmt: skip
+        low, high = found["case.gain"]["ci95"]
+        assert found["case.gain"]["value"] == pytest.approx(sign, abs=1e-15)
+        assert -1.0 <= low <= found["case.gain"]["value"] <= high <= 1.0 and high > low
+        constant = found["case.natural_frequency_rad_s"]
+        assert math.isnan(constant["value"]) and constant["ci95"] is None
+
+
+def test_infinite_results_differ_from_those_without_a_value(campaigns: Any) -> None:
+    plan = campaigns.plan(DESIGN.format("random", 9))
+    rows = campaigns.rows_of(plan, lambda gain, omega: gain)
+    rows[0] = replace(rows[0], results={"y": math.inf})
+    rows[1] = replace(rows[1], results={"y": -math.inf})
+    rows[2] = replace(rows[2], results={})
+    summary = summarised(plan, rows)
+    page = campaign_page(summary, {})
+    assert "<td>not reached</td>" in page and "<td>−infinite</td>" in page
+    written = json.loads(json_text(with_infinities(summary)))["distributions"][0]
+    assert (written["least"], written["largest"], written["mean"]) == ("-inf", "inf", None)
+    assert written["without_value"] == 1
+
+
+def test_cases_without_noise_have_no_coverage_and_the_page_says_why(campaigns: Any) -> None:
+    """The intervals of their fits have the width of rounding errors, and mean nothing."""
+    text = campaigns.quick.replace("[0.01, 0.02]", "[0.0]")
+    campaigns.run("exact", text)
+    plan = campaigns.plan(text)
+    summary = summarised(plan, finished_rows(plan, campaigns.folder / "exact"))
+    assert summary["coverage"] == []
+    assert set(summary["without_noise"]) >= {"gain", "delay_s", "natural_frequency_rad_s"}
+    assert "There is no coverage of" in campaign_page(summary, {})
+    campaigns.run("noisy")
+    plan = campaigns.plan()
+    summary = summarised(plan, finished_rows(plan, campaigns.folder / "noisy"))
+    assert summary["coverage"] and summary["without_noise"] == []
+
+
+def test_one_line_names_the_most_important_parameters_of_the_first_result(campaigns: Any) -> None:
+    plan = campaigns.plan(DESIGN.format("saltelli", 64))
+    rows = campaigns.rows_of(plan, lambda gain, omega: gain + 3.0 * omega)
+    rows = [replace(row, results={"y": row.results["y"], "a": 1.0}) for row in rows]
+    line = most_important(summarised(plan, rows), rows)
+    assert re.fullmatch(
+        r"y depends most on case\.natural_frequency_rad_s \(total Sobol index 0\.9\d?, 0\.\d+ to "
+        r"[01]\.?\d*\), case\.gain \(total Sobol index 0\.\d+, 0\.\d+ to 0\.\d+\)",
+        line,
+    ), line
+    plan = campaigns.plan(DESIGN.format("random", 40))
+    rows = campaigns.rows_of(plan, lambda gain, omega: -gain)
+    line = most_important(summarised(plan, rows), rows)
+    assert line.startswith("y depends most on case.gain (rank correlation -1, -1 to -1), case.nat")
+    few = rows[:4]
+    assert most_important({"sensitivities": []}, few) == ""
 
 
 def test_medians_of_the_same_cases_leave_out_those_without_a_value_in_both(campaigns: Any) -> None:

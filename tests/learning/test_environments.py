@@ -2,6 +2,7 @@
 
 import copy
 import pickle
+import warnings
 from dataclasses import replace
 
 import gymnasium
@@ -15,7 +16,7 @@ from haselab.base import InputError
 from haselab.learning import TASKS, StrainEnv, StrainVectorEnv
 from haselab.learning.simulation import StrainSimulation
 from haselab.rig.twin.config import TwinConfig
-from haselab.scoreboard.devices import drawn, find_device
+from haselab.scoreboard.devices import Device, drawn, find_device
 from haselab.scoreboard.loop_class import CLASSES
 from haselab.scoreboard.plant import FastPlant
 
@@ -158,6 +159,147 @@ def test_a_device_that_breaks_down_within_the_range_of_the_references_is_refused
         StrainEnv("track", devices=devices)
 
 
+def changed(section: str, **values: float) -> TwinConfig:
+    data = find_device("hz").config.model_dump(exclude={"origin"})
+    return TwinConfig(**{**data, section: {**data[section], **values}})
+
+
+@pytest.mark.parametrize(
+    ("wrong", "message"),
+    [
+        (
+            changed("load", mass_kg=15.0),
+            r"^Device 1 leaves the lengths in which its law is valid while it settles, at a drive "
+            r"of 0 V under \d[.\d]* kg\.",
+        ),
+        (
+            changed("dielectric", breakdown_v_per_m=1e6),
+            r"^Device 1 breaks down while it settles, at a drive of 1\.04 V under 0\.25 kg\.",
+        ),
+        (
+            changed("load", mass_kg=1e-6),
+            r"^Device 1 moves too fast .* 1e-06 kg.* 1\.85e\+06 rad/s, above the limit of 10000",
+        ),
+        (
+            changed("hysteresis", force_n=900.0, width=1.1e-4),
+            "^Device 1 moves too fast to be simulated",
+        ),
+        (
+            replace(find_device("hz"), late_s=0.009),
+            r"^Device 1 has an output delay of 11 ms\.",
+        ),
+    ],
+)
+def test_a_device_that_cannot_be_simulated_is_refused_with_the_reason(
+    wrong: object, message: str
+) -> None:
+    with pytest.raises(InputError, match=message):
+        StrainEnv("track", devices=[find_device("hz"), wrong])
+
+
+def episode(device: TwinConfig | Device) -> tuple[np.ndarray, np.ndarray]:
+    """True strains and observations while the drive changes."""
+    env = StrainEnv("track", devices=[device])
+    env.reset(seed=1)
+    steps = [env.step(np.array([np.sin(k / 6.0)], np.float32)) for k in range(60)]
+    return np.array([one[4]["strain"] for one in steps]), np.array([one[0] for one in steps])
+
+
+def test_keys_of_a_device_have_an_effect_or_a_warning_names_them() -> None:
+    public = find_device("hz").config
+    strain, seen = episode(public)
+    changes = {
+        "amplifier": {
+            "gain": 5100.0, "gain_error": 0.01, "bandwidth_hz": 5000.0, "damping_ratio": 0.7,
+            "slew_v_per_s": 1e8, "current_limit_a": 0.01, "stray_f": 1e-9,
+            "volt_per_monitor_volt": 4000.0, "ampere_per_monitor_volt": 1e-3,
+            "v_monitor_gain_error": 0.01, "i_monitor_gain_error": 0.01, "v_monitor_lag_s": 1e-5,
+            "i_monitor_lag_s": 1e-5, "v_monitor_offset_v": 0.01, "i_monitor_offset_v": 0.01,
+        },
+        "acquisition": {
+            "rate_hz": 100e3, "block_samples": 4000, "bits": 12, "range_v": 5.0, "skew_s": 0.0,
+            "v_noise_v": 1e-3, "i_noise_v": 1e-3, "output_delay_s": 4e-3, "drive_low_v": -1.0,
+            "drive_high_v": 1.8,
+        },
+        "dielectric": {"series_ohm": 6e3, "leakage_ohm": 1e10},
+        "camera": {"rate_hz": 300.0, "exposure_s": 5e-4},
+    }  # fmt: skip
+    for section in ("amplifier", "acquisition"):
+        assert changes[section].keys() == type(getattr(public, section)).model_fields.keys() - {
+            "name"
+        }
+    without = []
+    for section, values in changes.items():
+        for key, value in values.items():
+            with warnings.catch_warnings(record=True) as caught:
+                warnings.simplefilter("always")
+                found = episode(changed(section, **{key: value}))[1]
+            expected = [f"The environments ignore {section}.{key} of the devices, so these values "
+                        "have no effect."]  # fmt: skip
+            alike = np.array_equal(found, seen)
+            assert [str(one.message) for one in caught] == (expected if alike else []), key
+            without += [key] if alike else []
+    assert "stray_f" in without and "skew_s" in without and "output_delay_s" not in without
+    # the rate of the converter changes the noise, and not the motion
+    np.testing.assert_array_equal(episode(changed("acquisition", rate_hz=100e3))[0], strain)
+
+
+def test_the_output_delay_of_a_device_delays_its_motion() -> None:
+    """Whole updates later or earlier are other actions, so 10 ms more is one action before."""
+    public = find_device("hz")
+    none, usual = (episode(changed("acquisition", output_delay_s=s))[0] for s in (0.0, 0.002))
+    whole = episode(replace(public, late_s=0.008))[0]
+    np.testing.assert_array_equal(usual, episode(public)[0])
+    assert np.abs(none - usual).max() > 1e-4
+    np.testing.assert_allclose(whole[1:], none[:-1], atol=1e-6)
+
+
+@pytest.mark.parametrize("task", list(TASKS))
+def test_the_information_of_a_step_gives_its_reward_exactly(task: str) -> None:
+    """With the formula of docs/control/learning.md; the drive goes from 0 to 2 V."""
+    env, envs = StrainEnv(task, devices=DEVICES), StrainVectorEnv(4, task, devices=DEVICES)
+    _, before = env.reset(seed=3)
+    _, all_before = envs.reset(seed=3)
+    rng = np.random.default_rng(2)
+    for _ in range(300):
+        action = rng.uniform(-1.0, 1.0, (4, 1)).astype(np.float32)
+        seen, reward, _, _, about = env.step(action[0])
+        change = about["drive_v"] - before["drive_v"]
+        error = abs(about["strain"] - about["reference"])
+        assert reward == -error / 0.05 - 0.05 * (change * change)  # pow may round another way
+        _, rewards, _, _, all_about = envs.step(action)
+        changes = all_about["drive_v"] - all_before["drive_v"]
+        errors = np.abs(all_about["strain"] - all_about["reference"])
+        np.testing.assert_array_equal(rewards, -errors / 0.05 - 0.05 * changes**2)
+        before, all_before = about, all_about
+    # the observation has the reference of the next update
+    assert seen[3] == np.float32(env._simulation.reference[0] / 0.05)
+
+
+@pytest.mark.parametrize("task", ["track", "hold"])
+def test_long_episodes_change_until_their_end_and_short_ones_are_as_before(task: str) -> None:
+    """A value is held for 2 s at most."""
+    time_s = 0.01 * np.arange(1.0, 60002.0)
+    for seed in range(6):
+        long, short = (
+            TASKS[task].draw(np.random.default_rng(seed), part)
+            for part in (time_s, time_s[:501])
+        )  # fmt: skip
+        changing = long[0] if task == "track" else long[1]
+        gaps = np.diff(np.flatnonzero(np.diff(changing)), append=time_s.size)
+        assert gaps.max() <= 201
+        for whole, begin in zip(long, short, strict=True):
+            if task == "track":
+                np.testing.assert_array_equal(whole[:501], begin)
+    level, pulls = TASKS["hold"].draw(np.random.default_rng(5), time_s[:501])
+    drawn_alike = np.random.default_rng(5)
+    edges = np.cumsum(drawn_alike.uniform(0.4, 2.0, 64))
+    values = drawn_alike.uniform(-0.05, 0.05, 65)
+    values[0] = 0.0
+    np.testing.assert_array_equal(pulls, values[np.searchsorted(edges, time_s[:501])])
+    assert level[0] == drawn_alike.uniform(0.3, 0.7)
+
+
 def test_a_breakdown_ends_the_episode_and_costs_100() -> None:
     weak = drawn(np.random.default_rng(3))
     data = weak.config.model_dump(exclude={"origin"})
@@ -276,7 +418,7 @@ def test_actions_of_another_shape_are_refused(shape: tuple[int, ...]) -> None:
 
 def test_copies_and_pictures_of_many_are_refused_with_the_remedy() -> None:
     env = StrainEnv("track", devices=1)
-    for copied in (copy.deepcopy, pickle.dumps):
+    for copied in (copy.copy, copy.deepcopy, pickle.dumps):
         for one in (env, StrainVectorEnv(2, "track", devices=1)):
             with pytest.raises(TypeError, match="Give each process a function that makes one"):
                 copied(one)

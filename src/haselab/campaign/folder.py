@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import contextlib
+import zlib
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
@@ -19,11 +20,11 @@ from haselab.store.folder import drafted, json_text, read_json, write_new, write
 from haselab.store.optional import library
 
 __all__ = [
-    "CAMPAIGN", "FAILED", "TABLE", "changes_of", "described_in", "finished_rows", "open_folder",
-    "plan_of", "read_results", "write_table",
+    "CAMPAIGN", "FAILED", "TABLE", "changes_of", "described_in", "doubts_about", "finished_rows",
+    "open_folder", "plan_of", "read_results", "table_checksum", "write_table",
 ]  # fmt: skip
 
-CAMPAIGN, DESIGN = "campaign.json", "design.npy"
+CAMPAIGN, DESIGN, SUMMARY = "campaign.json", "design.npy", "summary.json"
 TABLE, FAILED = "results.parquet", "failed.txt"
 _MOST_SHOWN = 3
 _ROWS_IN_GROUP = 50_000
@@ -163,8 +164,9 @@ def write_table(plan: Plan, rows: Sequence[CaseRow], folder: Path) -> None:
     try:
         with drafted(folder / TABLE) as draft:
             parquet.write_table(
-                arrow.table(columns), draft, compression="zstd", row_group_size=_ROWS_IN_GROUP
-            )
+                arrow.table(columns), draft, compression="zstd", row_group_size=_ROWS_IN_GROUP,
+                write_page_checksum=True,
+            )  # fmt: skip
     except OSError as error:
         raise DeviceError(
             f"Cannot write ({error.strerror or error}). Free disk space. {folder / TABLE}"
@@ -191,14 +193,80 @@ def read_results(folder: Path) -> dict[str, NDArray[np.float64]]:
     arrow: Any = library("pyarrow", "campaign")
     parquet: Any = library("pyarrow.parquet", "campaign")
     try:
-        table = parquet.read_table(path)
-    except (arrow.ArrowException, OSError) as error:
+        table = parquet.read_table(path, page_checksum_verification=True)
+        table.validate(full=True)
+    except (arrow.ArrowException, OSError, ValueError) as error:
         text = " ".join(str(error).split())[:200]
         raise InputError(f"Not a table of a campaign ({text}). {path}") from None
+    about = _summary_of(folder)
+    if "table_crc32" in about and about["table_crc32"] != table_checksum(folder):
+        raise InputError(
+            f"{TABLE} is not the table of summary.json in this folder: one of them is damaged or "
+            f"older. Start the command of that campaign again, and then this one. {path}"
+        )
     return {
         name: table.column(name).to_numpy(zero_copy_only=False).astype(np.float64)
         for name in table.column_names if table.schema.field(name).type == arrow.float64()
     }  # fmt: skip
+
+
+def table_checksum(folder: Path) -> str:
+    """CRC-32 of the final table, in hexadecimal digits, for `summary.json`.
+
+    The checksums of Parquet leave out the names of the columns.
+
+    Args:
+        folder: of a finished campaign.
+    """
+    return f"{zlib.crc32((folder / TABLE).read_bytes()):08x}"
+
+
+def _summary_of(folder: Path) -> Mapping[str, Json]:
+    """The summary in a folder; an empty one if there is none that can be read."""
+    with contextlib.suppress(InputError, OSError):
+        if isinstance(found := read_json(folder / SUMMARY), dict):
+            return found
+    return {}
+
+
+def doubts_about(folder: Path, code: str) -> list[str]:
+    """Why the results in a folder may not be those that its campaign would give now.
+
+    Args:
+        folder: of a campaign that was finished once.
+        code: version of the code here, see `Plan.code`.
+    Returns:
+        One text for each reason: another version of the code, no summary, or finished cases that
+        are not in the table.
+    Raises:
+        InputError: a shard is damaged.
+    """
+    there = _summary_of(folder).get("code")
+    found = list[str]()
+    if there is None:
+        found.append("its summary.json is missing or unreadable, so the version of its code is "
+                     "unknown")  # fmt: skip
+    elif there != code:
+        found.append(f"it was computed by haselab {there}, and this one by haselab {code}")
+    if count := _not_in_table(folder):
+        found.append(
+            f"its table lacks {count:,} cases that were finished later: start its command again"
+        )
+    return found
+
+
+def _not_in_table(folder: Path) -> int:
+    """Number of results in shards that are newer than the table and not in it."""
+    table_s = (folder / TABLE).stat().st_mtime
+    if all(path.stat().st_mtime <= table_s for path in (folder / "shards").glob("*.parquet")):
+        return 0  # a copied folder may have other times, so that its table has to be read
+    parquet: Any = library("pyarrow.parquet", "campaign")
+    table = parquet.read_table(folder / TABLE).to_pydict()
+    listed = dict(zip(table.get("case", ()), table.get("status", ()), strict=False))
+    return sum(
+        case not in listed or (listed[case] != "ok" and not state.failed)
+        for case, state in Shards(folder, "").states().items()
+    )
 
 
 def described_in(folder: Path) -> JsonObject:

@@ -10,7 +10,6 @@ import math
 import re
 from collections import Counter
 from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
@@ -18,99 +17,25 @@ from numpy.typing import NDArray
 
 from haselab.base import Json, JsonObject
 from haselab.campaign.definition import Campaign
+from haselab.campaign.groups import LEAST_CASES, Group, groups_of, number_of, result_names
 from haselab.campaign.over_axes import over_axes
 from haselab.campaign.plan import Plan
+from haselab.campaign.sensitivities import sensitivities, unranked_of
 from haselab.store.campaign.shards import CaseRow
-from haselab.store.optional import library
 
 __all__ = [
-    "LEAST_CASES", "Group", "compared", "draws_are_independent", "groups_of", "is_random",
-    "median_interval", "paired", "result_names", "share_cases", "summarised",
+    "compared", "draws_are_independent", "is_random", "median_interval", "most_important", "paired",
+    "share_cases", "summarised", "with_infinities",
 ]  # fmt: skip
 
 Floats = NDArray[np.float64]
 _QUANTILES = {"p05": 0.05, "median": 0.5, "p95": 0.95}
 _SIDE = 0.025
-_OF_ESTIMATES = (".std", ".low", ".high", ".true")
-_MOST_GROUPS = 24
+_EXACT = 1e-9  # width over the value: fits of records without noise have 1e-15 to 1e-11
 _RESAMPLED = 1000
-# Sample blocks that an interval of a Sobol index needs. Intervals from 8 or 16 blocks contained the
-# known total indices of the Ishigami function in only 68 to 75 % of simulated campaigns; those from
-# 64 blocks in 95 % or more.
-_LEAST_BLOCKS = 64
 _SEED = 1  # of resampling: the same rows give the same intervals
-LEAST_CASES = 8
 _MOST_COMPARED = 8  # values of an axis
 _NUMBER = re.compile(r"(?<!\w)-?\d[\d.,]*(?:e[-+]?\d+)?", re.IGNORECASE)
-
-
-@dataclass(frozen=True)
-class Group:
-    """Cases at one point of the axes.
-
-    Args:
-        label: values of the axes, in words; empty: all cases.
-        rows: of the cases.
-    """
-
-    label: str
-    rows: tuple[CaseRow, ...]
-
-    def values(self, name: str) -> Floats:
-        """A result of all cases; NaN where there is none. Shape `(N,)`."""
-        return np.array([_number(row.results.get(name)) for row in self.rows])
-
-    def present(self, name: str) -> Floats:
-        """A result of the cases that have it, infinite where it was not reached. Shape `(N,)`."""
-        found = self.values(name)
-        return found[~np.isnan(found)]
-
-
-def _number(value: Json) -> float:
-    return float(value) if isinstance(value, (int, float)) else math.nan
-
-
-def result_names(rows: Sequence[CaseRow]) -> list[str]:
-    """Names of the results, without what belongs to an estimate.
-
-    Args:
-        rows: of cases.
-    Returns:
-        The names in alphabetical order.
-    """
-    found = dict.fromkeys(name for row in rows for name in row.results)
-    return [name for name in sorted(found) if not name.endswith(_OF_ESTIMATES)]
-
-
-def groups_of(campaign: Campaign, rows: Sequence[CaseRow]) -> list[Group]:
-    """The cases at each point of the axes; all together if there is little at each, or too many.
-
-    Args:
-        campaign: of the rows.
-        rows: in the order of their indices.
-    Returns:
-        The groups.
-    """
-    many = math.prod(len(axis.values) for axis in campaign.axes)
-    each = campaign.count // many
-    if many == 1 or many > _MOST_GROUPS or each < LEAST_CASES:
-        return [Group("", tuple(rows))]
-    short = _short_names([axis.path for axis in campaign.axes])
-    found: dict[str, list[CaseRow]] = {}
-    for row in rows:
-        label = ", ".join(
-            f"{name} = {row.values[axis.path]}"
-            for name, axis in zip(short, campaign.axes, strict=True)
-        )
-        found.setdefault(label, []).append(row)
-    return [Group(label, tuple(part)) for label, part in found.items()]
-
-
-def _short_names(paths: Sequence[str]) -> list[str]:
-    """The last parts of the paths; whole paths where those would not say which parameter it is."""
-    last = [path.rpartition(".")[2] for path in paths]
-    clear = len(set(last)) == len(last) and not any(name.isdecimal() for name in last)
-    return last if clear else list(paths)
 
 
 def summarised(plan: Plan, rows: Sequence[CaseRow]) -> JsonObject:
@@ -148,13 +73,66 @@ def summarised(plan: Plan, rows: Sequence[CaseRow]) -> JsonObject:
             for group in groups
             if (found := _coverage(group, name, independent=independent))
         ],
-        "sensitivities": list(_sensitivities(campaign, groups, names, independent=independent)),
-        "unranked": [*_unranked(campaign)],
+        "without_noise": [*_without_noise(groups, names)],
+        "sensitivities": list(sensitivities(campaign, groups, names, independent=independent)),
+        "unranked": [*unranked_of(campaign)],
         "over_axes": _over_axes(campaign, groups, names),
         "axis_differences": [*_axis_differences(campaign, rows, names)],
         "failures": _failures(rows),
         "without_effect": [*_without_effect(campaign, rows)],
     }
+
+
+def with_infinities(found: Json) -> Json:
+    """Replace infinite numbers by the texts `inf` and `-inf`, because JSON has none.
+
+    Args:
+        found: numbers, texts, lists and tables.
+    Returns:
+        The same; NaN stays, which `to_plain` makes null.
+    """
+    if isinstance(found, Mapping):
+        return {name: with_infinities(value) for name, value in found.items()}
+    if isinstance(found, (list, tuple)):
+        return [with_infinities(value) for value in found]
+    if isinstance(found, float) and math.isinf(found):
+        return "inf" if found > 0.0 else "-inf"
+    return found
+
+
+def most_important(summary: Mapping[str, Any], rows: Sequence[CaseRow]) -> str:
+    """The parameters on which the first result of the kind depends most, in one line.
+
+    Args:
+        summary: see `summarised`.
+        rows: of the cases.
+    Returns:
+        Up to three, the most important first, at the first point of the axes; an empty text if
+        there are no sensitivities.
+    """
+    order = [name for row in rows[:1000] for name in row.results]  # the order of the kind
+    found = summary["sensitivities"]
+    known = {one["result"] for one in found}
+    name = next((name for name in order if name in known), None)
+    if name is None:
+        return ""
+    found = [one for one in found if one["result"] == name]
+    label = found[0]["group"]
+    listed = []
+    for one in found:
+        kind, number = (
+            ("total Sobol index", one["total"]) if "total" in one
+            else ("rank correlation", one["correlation"])
+        )  # fmt: skip
+        if one["group"] == label and not math.isnan(number["value"]):
+            ends = number["ci95"]
+            near = "" if ends is None else f", {ends[0]:.2g} to {ends[1]:.2g}"
+            text = f"{one['parameter']} ({kind} {number['value']:.2g}{near})"
+            listed.append((-abs(number["value"]), text))
+    if not listed:
+        return ""
+    place = f" at {label}" if label else ""
+    return f"{name}{place} depends most on {', '.join(text for _, text in sorted(listed)[:3])}"
 
 
 def _over_axes(campaign: Campaign, groups: Sequence[Group], names: Sequence[str]) -> list[Json]:
@@ -181,7 +159,7 @@ def _axis_differences(
     each = campaign.points * campaign.design.repeats
     shape = (*(len(axis.values) for axis in campaign.axes), each)
     columns = {
-        name: np.array([_number(row.results.get(name)) for row in rows]).reshape(shape)
+        name: np.array([number_of(row.results.get(name)) for row in rows]).reshape(shape)
         for name in names
     }
     for place, axis in enumerate(campaign.axes):
@@ -240,8 +218,10 @@ def _distribution(group: Group, name: str, *, independent: bool) -> JsonObject:
         }
         for key, share in _QUANTILES.items()
     }
-    with np.errstate(invalid="ignore"):  # the mean of infinities of both signs is NaN
-        mean = float(values.mean())
+    with np.errstate(invalid="ignore", over="ignore"):
+        mean = float(values.mean())  # of infinities of both signs: NaN
+    if math.isinf(mean) and np.isfinite(values).all():
+        mean = float((values / values.size).sum())  # only the sum of all was too large
     ends = {"least": float(values[0]), "mean": mean, "largest": float(values[-1])}
     return {**answer, **quantiles, **ends}
 
@@ -283,7 +263,7 @@ def _coverage(group: Group, name: str, *, independent: bool) -> JsonObject | Non
     # infinity, of a positive parameter
     known = np.isfinite(true) & ~np.isnan(low) & ~np.isnan(high)
     known &= np.isfinite(low) | np.isfinite(high)
-    known &= low < high  # an exact number has no interval
+    known &= ~_is_exact(group, name)
     known &= ~np.isinf(group.values(f"{name}.std"))
     inside, count = int(((low <= true) & (true <= high))[known].sum()), int(known.sum())
     if count == 0:
@@ -298,103 +278,28 @@ def _coverage(group: Group, name: str, *, independent: bool) -> JsonObject | Non
     }  # fmt: skip
 
 
+def _is_exact(group: Group, name: str) -> NDArray[np.bool_]:
+    """Whether the interval of each case is only as wide as rounding errors: there was no noise."""
+    low, high = group.values(f"{name}.low"), group.values(f"{name}.high")
+    with np.errstate(invalid="ignore"):  # infinite ends
+        return np.asarray(high - low <= _EXACT * np.abs(group.values(f"{name}.true")))
+
+
+def _without_noise(groups: Sequence[Group], names: Sequence[str]) -> list[str]:
+    """Estimates of which all intervals in some group are exact, so that it has no coverage."""
+    return [
+        name for name in names
+        if any(_is_exact(group, name).any() for group in groups)
+        and all(_coverage(group, name, independent=False) is None for group in groups)
+    ]  # fmt: skip
+
+
 def _share_interval(inside: int, count: int) -> list[float]:
     from scipy.stats import beta  # slow to import
 
     low = beta.ppf(_SIDE, inside, count - inside + 1) if inside else 0.0
     high = beta.ppf(1.0 - _SIDE, inside + 1, count - inside) if inside < count else 1.0
     return [float(low), float(high)]
-
-
-# ---- sensitivities -----------------------------------------------------------------------------
-
-
-def _sensitivities(
-    campaign: Campaign, groups: Sequence[Group], names: Sequence[str], *, independent: bool
-) -> Iterator[JsonObject]:
-    unranked = _unranked(campaign)
-    paths = [one.path for one in campaign.distributions if one.path not in unranked]
-    for name in names:
-        for group in groups:
-            if campaign.design.kind == "saltelli":
-                found = _sobol_indices(group, name, paths) if _is_whole(campaign, groups) else []
-            else:
-                found = _rank_correlations(group, name, paths, independent=independent)
-            for one in found:
-                yield {"result": name, "group": group.label, **one}
-
-
-def _unranked(campaign: Campaign) -> list[str]:
-    """Parameters that are drawn from values that are no numbers, so that they have no ranks."""
-    return [
-        one.path for one in campaign.distributions
-        if not all(isinstance(each, (int, float)) for each in one.numbers)
-    ]  # fmt: skip
-
-
-def _is_whole(campaign: Campaign, groups: Sequence[Group]) -> bool:
-    """Whether each group is one sample of the design, which indices need."""
-    return all(len(group.rows) == campaign.points for group in groups)
-
-
-def _sobol_indices(group: Group, name: str, paths: Sequence[str]) -> list[JsonObject]:
-    """First-order and total indices by SALib, without sample blocks in which a case failed."""
-    blocks = group.values(name).reshape(-1, len(paths) + 2)
-    whole = blocks[np.isfinite(blocks).all(axis=1)]
-    if whole.shape[0] < LEAST_CASES or np.ptp(whole) == 0.0:
-        return []
-    analyse = library("SALib.analyze.sobol", "campaign").analyze
-    bounds = {"num_vars": len(paths), "names": list(paths), "bounds": [[0.0, 1.0]] * len(paths)}
-    found = analyse(
-        bounds, whole.reshape(-1), calc_second_order=False, num_resamples=200, seed=_SEED
-    )
-    return [
-        {
-            "parameter": path, "method": "Sobol indices", "blocks": whole.shape[0],
-            "blocks_left_out": blocks.shape[0] - whole.shape[0],
-            "first": _around(found["S1"][k], found["S1_conf"][k], whole.shape[0]),
-            "total": _around(found["ST"][k], found["ST_conf"][k], whole.shape[0]),
-        }
-        for k, path in enumerate(paths)
-    ]  # fmt: skip
-
-
-def _around(value: float, half: float, blocks: int) -> JsonObject:
-    """A number with its interval, if there are enough blocks to trust it."""
-    ends = [float(value - half), float(value + half)] if blocks >= _LEAST_BLOCKS else None
-    return {"value": float(value), "ci95": ends}
-
-
-def _rank_correlations(
-    group: Group, name: str, paths: Sequence[str], *, independent: bool
-) -> list[JsonObject]:
-    r"""Spearman's $\rho$ between each parameter and a result, with Fisher's interval.
-
-    The standard error of $\mathrm{artanh}\,\rho$ is $\sqrt{(1 + \rho^2/2)/(n - 3)}$ (Bonett and
-    Wright, 2000).
-    """
-    from scipy.stats import spearmanr  # slow to import
-
-    values = group.values(name)
-    good = ~np.isnan(values)  # infinite: not reached, which ranks above any number
-    count = int(good.sum())
-    if count < LEAST_CASES or np.unique(values[good]).size < 2:
-        return []
-    found: list[JsonObject] = []
-    for path in paths:
-        x = np.array([_number(row.values[path]) for row in group.rows])[good]
-        rho = float(spearmanr(x, values[good]).statistic)
-        middle = np.arctanh(np.clip(rho, -1.0 + 1e-12, 1.0 - 1e-12))
-        half = 1.959964 * math.sqrt((1.0 + 0.5 * rho * rho) / (count - 3.0))
-        ends = np.tanh([middle - half, middle + half])
-        found.append({
-            "parameter": path, "method": "rank correlation", "count": count,
-            "without_value": values.size - count,
-            "correlation": {
-                "value": rho, "ci95": [float(end) for end in ends] if independent else None,
-            },
-        })  # fmt: skip
-    return found
 
 
 # ---- failures and comparison -------------------------------------------------------------------

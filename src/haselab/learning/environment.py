@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from typing import Any
+from typing import Any, NoReturn
 
 import gymnasium
 import numpy as np
@@ -57,7 +57,8 @@ class StrainEnv(gymnasium.Env[NDArray[np.float32], NDArray[np.float32]]):
 
     Each episode takes one of the drawn devices. The reward of an update is
     `-|strain - reference| / 0.05 - 0.05 change**2` with the true strain and the change of the
-    action, and -100 if the device breaks down, which ends the episode.
+    action, and -100 if the device breaks down, which ends the episode. The information of a step
+    has this `strain` and `reference`; the observation has the reference of the next update.
 
     Args:
         task: `track`, `hold` or `gait`.
@@ -143,10 +144,18 @@ class StrainEnv(gymnasium.Env[NDArray[np.float32], NDArray[np.float32]]):
         self._frames += 1
         return np.repeat(grey[:, :, None], 3, axis=2)
 
+    def __copy__(self) -> NoReturn:
+        """Refuse copies, as `StrainSimulation` does.
+
+        Raises:
+            TypeError: always.
+        """
+        self._simulation.__reduce__()
+
     def _info(self) -> JsonObject:
         simulation = self._simulation
         return {
             "strain": float(simulation.strain[0]),
-            "reference": float(simulation.reference[0]),
+            "reference": float(simulation.rewarded_reference[0]),
             "drive_v": float(simulation.drive_v[0]),
         }

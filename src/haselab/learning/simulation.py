@@ -3,9 +3,10 @@
 from __future__ import annotations
 
 import math
+import warnings
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from typing import cast
+from typing import NoReturn, cast
 
 import numpy as np
 from numpy.typing import NDArray
@@ -15,6 +16,7 @@ from haselab.actuators import GRAVITY_M_S2
 from haselab.base import InputError, is_real, shown
 from haselab.controllers.network.controller import STRAIN_PER_ONE
 from haselab.learning.tasks import find_task
+from haselab.rig.twin.camera import TwinCameraConfig
 from haselab.rig.twin.config import TwinConfig
 from haselab.rig.twin.twin_bench import native_bench
 from haselab.scoreboard.devices import ZERO_LENGTH_M, Device, drawn, find_device
@@ -39,6 +41,20 @@ _TRAIN_S, _REST_S = 20.0, 60.0
 _MAP_KNOTS = 200
 _USED = 0.85  # of the drive's range: no drawn device breaks down there
 _REACH_UPDATES = 200
+_FAULTS = {1: "breaks down", 2: "leaves the lengths in which its law is valid"}
+_FASTEST_RAD_S = 1e4  # the compiled motion then takes about 2 s for the 140 s in which it settles
+_RATE_HZ = 200e3  # of the converter: the twin moves in steps of 20 samples
+# Keys of a twin without effect: amplifier and monitors have no errors but noise and gain.
+_IGNORED = {
+    "dielectric": ("series_ohm", "leakage_ohm"),
+    "amplifier": (
+        "slew_v_per_s", "current_limit_a", "stray_f",
+        "v_monitor_gain_error", "i_monitor_gain_error", "v_monitor_lag_s", "i_monitor_lag_s",
+        "v_monitor_offset_v", "i_monitor_offset_v",
+    ),
+    "acquisition": ("block_samples", "skew_s", "drive_low_v", "drive_high_v"),
+    "camera": tuple(TwinCameraConfig.model_fields),
+}  # fmt: skip
 
 
 def whole_number(name: str, value: object, low: int, high: int) -> None:
@@ -80,6 +96,7 @@ class StrainSimulation:
         slots: number of loops.
         devices: how many different devices are drawn, or the devices; each episode takes one. A
             `TwinConfig` is driven from 0 to 2 V, and has strain 0 at 1.04 V, like the public twin.
+            A warning names keys that differ from those of the public twin and have no effect.
         devices_seed: of the drawn devices.
         episode_s: duration of an episode, in s.
     Raises:
@@ -106,6 +123,7 @@ class StrainSimulation:
         self._time_s: Floats = _LOOP.period_s * np.arange(1.0, self._updates + 2.0)
         self.slots = slots
         self._reference = np.zeros((slots, self._updates + 1))
+        self.rewarded_reference = np.zeros(slots)  # strains that the last rewards compared with
         self._pull_n = np.zeros((slots, self._updates + 1))
         self._device = np.zeros(slots, dtype=np.int64)
         self._update = np.zeros(slots, dtype=np.int64)
@@ -122,7 +140,7 @@ class StrainSimulation:
         self._map_strain = lengths / ZERO_LENGTH_M - 1.0
         self._reach = _reach(self._pool)
 
-    def __reduce__(self) -> tuple[object, ...]:
+    def __reduce__(self) -> NoReturn:
         """Refuse copies and pickles, with a message that says what to do instead.
 
         Raises:
@@ -171,6 +189,7 @@ class StrainSimulation:
             self._pull_n[slot] = pool.load_n[device] * pull
         sensed = self._sense(np.asarray(pool.zero_f[chosen]), chosen, rng)
         self._strain[:, which] = sensed
+        self.rewarded_reference[which] = self._reference[which, 0]
 
     def _begin(self, which: NDArray[np.int64], devices: NDArray[np.int64]) -> None:
         """Set loops to devices at rest, at the drive of strain 0."""
@@ -228,7 +247,8 @@ class StrainSimulation:
             drive[1], drive[0], self._load_n + pull_n,
             self._capacitance_f, self.length_m,
         )  # fmt: skip
-        error = (self.strain - self.reference) / STRAIN_PER_ONE
+        self.rewarded_reference = self.reference
+        error = (self.strain - self.rewarded_reference) / STRAIN_PER_ONE
         change = (drive[0] - drive[1]) / self._scale_v
         rewards = -np.abs(error) - CHANGE_COST * change**2
         terminated = np.zeros(self.slots, dtype=bool)
@@ -263,11 +283,18 @@ class StrainSimulation:
 
 def _pool(devices: int | Sequence[Device | TwinConfig], seed: int) -> _Pool:
     listed = [_device(one) for one in _listed(devices, seed)]
-    settled = [_settled(one) for one in listed]
+    if ignored := [name for name in _ignorable() if any(_changes(one, name) for one in listed)]:
+        named = ", ".join(ignored)
+        warnings.warn(
+            f"The environments ignore {named} of the devices, so these values have no effect.",
+            stacklevel=2,
+        )
+    switch_at = tuple(_switch_at(one, number) for number, one in enumerate(listed))
+    settled = [_settled(one, number) for number, one in enumerate(listed)]
     low_v, high_v = (np.array([getattr(one, end) for one in listed]) for end in ("low_v", "high_v"))
     return _Pool(
         tuple(settled),
-        tuple(_LOOP.switch_at + round(one.late_s / STEP_S) for one in listed),
+        switch_at,
         np.array([bench.length_m for bench in settled]),
         np.array([bench.capacitance(bench.length_m, one.zero_v * one.config.amplifier.gain)
                   for bench, one in zip(settled, listed, strict=True)]),
@@ -308,6 +335,47 @@ def _device(given: object) -> Device:
     return given
 
 
+def _ignorable() -> list[str]:
+    return [f"{section}.{name}" for section, names in _IGNORED.items() for name in names]
+
+
+def _changes(device: Device, name: str) -> bool:
+    """Whether a key of a device differs from that of the public one."""
+    section, key = name.split(".")
+    own, public = (getattr(one.config, section) for one in (device, find_device("hz")))
+    return bool(getattr(own, key) != getattr(public, key))
+
+
+def _switch_at(device: Device, number: int) -> int:
+    """Step of an update at which the output of the one before takes effect."""
+    delay_s = device.config.acquisition.output_delay_s + device.late_s
+    if not 0.0 <= delay_s <= _LOOP.period_s:
+        raise InputError(
+            f"Device {number} has an output delay of {1e3 * delay_s:.3g} ms. In the environments, "
+            f"acquisition.output_delay_s and late_s together are 0 to {1e3 * _LOOP.period_s:g} ms."
+        )
+    return round(delay_s / STEP_S)
+
+
+def _check_speed(device: Device, number: int) -> None:
+    """Refuse a device whose simulation would take very long."""
+    law, load = device.law, device.config.load
+    losses, free_m = law.losses, law.free_length_m
+    near_n = law.elastic_force_n(np.array([0.999, 1.001]) * free_m)
+    held = 1.0 + losses.softening_share + sum(losses.branch_share)
+    stiffness = abs(float(near_n[1] - near_n[0])) / (0.002 * free_m) * held
+    if losses.hysteresis_n > 0.0:
+        stiffness += 2.0 * losses.hysteresis_n / (losses.hysteresis_width * free_m)
+    inertia_kg = load.mass_kg + load.added_inertia_kg + law.moving_mass_kg
+    fastest = max(losses.damping_n_s_per_m / inertia_kg, math.sqrt(stiffness / inertia_kg))
+    if fastest > _FASTEST_RAD_S:
+        raise InputError(
+            f"Device {number} moves too fast to be simulated in reasonable time: with an inertia "
+            f"of {inertia_kg:.3g} kg, its resonance or the rate of its damper is "
+            f"{fastest:.3g} rad/s, above the limit of {_FASTEST_RAD_S:g} rad/s. Raise its mass."
+        )
+
+
 def _reach(pool: _Pool) -> tuple[Floats, Floats]:
     """Strains at rest at the lowest drive and at `_USED` of the highest. Shapes `(devices,)`."""
     count = len(pool.benches)
@@ -323,10 +391,10 @@ def _reach(pool: _Pool) -> tuple[Floats, Floats]:
             ends.update(held, held, pool.load_n, farad, length_m)
         if ends.any_fault:
             first = next(k for k in range(count) if ends.fault(k))
+            end = "a lower high_v" if share > 0.0 else "another low_v"
             raise InputError(
-                f"Device {first} breaks down, or leaves the lengths in which its law is valid, at "
-                f"a drive of {held[first]:.3g} V. Leave it out, or give a Device with a lower "
-                "high_v."
+                f"Device {first} {_FAULTS[ends.fault(first)]} at a drive of "
+                f"{held[first]:.3g} V. Leave it out, or give a Device with {end}."
             )
         found.append(length_m / pool.zero_m - 1.0)
     return found[0], found[1]
@@ -337,9 +405,11 @@ def _noise(device: Device, length_m: float) -> float:
     return noise_of(_LOOP, device.config, farad) / farad
 
 
-def _settled(device: Device) -> _twin.Bench:
+def _settled(device: Device, number: int) -> _twin.Bench:
     """A bench whose device was stretched once, and now hangs at the drive of strain 0."""
-    bench = native_bench(device.config, 0)
+    _check_speed(device, number)
+    clock = device.config.acquisition.model_copy(update={"rate_hz": _RATE_HZ})
+    bench = native_bench(device.config.model_copy(update={"acquisition": clock}), 0)
     bench.carrier_v, bench.carrier_rad_s = CARRIER_V, 2.0 * math.pi * CARRIER_HZ
     own_kg = device.config.load.added_inertia_kg + device.law.moving_mass_kg
     plan = ((TRAINED, 0.0, _TRAIN_S), (1.0, 0.0, _REST_S), (1.0, device.zero_v, _REST_S))
@@ -348,4 +418,9 @@ def _settled(device: Device) -> _twin.Bench:
         bench.inertia_kg = mass_kg + own_kg
         lengths = np.empty(round(duration_s / STEP_S))
         bench.move(np.array([drive_v]), 1, GRAVITY_M_S2 * mass_kg, lengths)
+        if bench.broken:
+            raise InputError(
+                f"Device {number} {_FAULTS[2 if bench.outside else 1]} while it settles, at a "
+                f"drive of {drive_v:.3g} V under {mass_kg:.3g} kg. Leave it out, or change it."
+            )
     return bench

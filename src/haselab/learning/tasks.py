@@ -15,6 +15,7 @@ __all__ = ["TASKS", "LearningTask", "find_task"]
 
 Floats = NDArray[np.float64]
 _LONGEST_HOLD_S, _SHORTEST_HOLD_S = 2.0, 0.4
+_CHANGES = 64  # of held values, which are drawn together: the first ones last 26 s or more
 _SINES_HZ = (0.1, 3.0)
 _GAITS_HZ = (0.5, 2.0)
 _PULL = 0.05  # largest
@@ -37,11 +38,23 @@ class LearningTask:
     draw: Callable[[np.random.Generator, Floats], tuple[Floats, Floats]]
 
 
+def _held(
+    rng: np.random.Generator, time_s: Floats, low: float, high: float, first: float | None = None
+) -> Floats:
+    """Values that are held for a random time each."""
+    edges = np.cumsum(rng.uniform(_SHORTEST_HOLD_S, _LONGEST_HOLD_S, _CHANGES))
+    values = rng.uniform(low, high, _CHANGES + 1)
+    values[0] = values[0] if first is None else first
+    while edges[-1] < time_s[-1]:
+        more = rng.uniform(_SHORTEST_HOLD_S, _LONGEST_HOLD_S, _CHANGES)
+        edges = np.append(edges, edges[-1] + np.cumsum(more))
+        values = np.append(values, rng.uniform(low, high, _CHANGES))
+    return np.asarray(values[np.searchsorted(edges, time_s)])
+
+
 def _steps(rng: np.random.Generator, time_s: Floats) -> Floats:
     """Levels that are held for a random time each."""
-    edges = np.cumsum(rng.uniform(_SHORTEST_HOLD_S, _LONGEST_HOLD_S, 64))
-    levels = rng.uniform(0.0, 1.0, 65)
-    return np.asarray(levels[np.searchsorted(edges, time_s) % 65])
+    return _held(rng, time_s, 0.0, 1.0)
 
 
 def _sine(rng: np.random.Generator, time_s: Floats) -> Floats:
@@ -60,11 +73,8 @@ def _track(rng: np.random.Generator, time_s: Floats) -> tuple[Floats, Floats]:
 
 def _hold(rng: np.random.Generator, time_s: Floats) -> tuple[Floats, Floats]:
     """A constant strain under a pull that changes at random times."""
-    edges = np.cumsum(rng.uniform(_SHORTEST_HOLD_S, _LONGEST_HOLD_S, 64))
-    pulls = rng.uniform(-_PULL, _PULL, 65)
-    pulls[0] = 0.0
-    level = rng.uniform(0.3, 0.7)
-    return np.full(time_s.size, level), np.asarray(pulls[np.searchsorted(edges, time_s) % 65])
+    pulls = _held(rng, time_s, -_PULL, _PULL, first=0.0)
+    return np.full(time_s.size, rng.uniform(0.3, 0.7)), pulls
 
 
 def _gait(rng: np.random.Generator, time_s: Floats) -> tuple[Floats, Floats]:

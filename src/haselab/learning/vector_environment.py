@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from typing import Any
+from typing import Any, NoReturn
 
 import numpy as np
 from gymnasium.vector import AutoresetMode, VectorEnv
@@ -31,8 +31,9 @@ class StrainVectorEnv(VectorEnv[Observed, Observed, Any]):
         task: `track`, `hold` or `gait`.
         options: see `StrainSimulation`.
 
-    The information of a step has the arrays `strain` (true), `reference` and `drive_v` (in V) of
-    all loops, and for each a mask with an underscore before its name, which is always true.
+    The information of a step has the arrays `strain` (true), `reference` (both as in its rewards)
+    and `drive_v` (in V) of all loops, and for each a mask with an underscore before its name, which
+    is always true.
     Raises:
         InputError: An argument is unknown or out of range.
     Example:
@@ -115,11 +116,19 @@ class StrainVectorEnv(VectorEnv[Observed, Observed, Any]):
         self._ended = terminated | truncated
         return self._simulation.observe(), rewards, terminated, truncated, self._info()
 
+    def __copy__(self) -> NoReturn:
+        """Refuse copies, as `StrainSimulation` does.
+
+        Raises:
+            TypeError: always.
+        """
+        self._simulation.__reduce__()
+
     def _info(self) -> JsonObject:
         simulation = self._simulation
         found = {
             "strain": simulation.strain,
-            "reference": simulation.reference,
+            "reference": simulation.rewarded_reference.copy(),
             "drive_v": simulation.drive_v.copy(),  # the next step changes it
         }
         return {**found, **{f"_{name}": self._all for name in found}}

@@ -84,6 +84,11 @@ def _about(summary: Mapping[str, Any]) -> str:
         parts.append(
             f"The sensitivities leave out {', '.join(unranked)}, whose values are no numbers."
         )
+    if exact := summary.get("without_noise", ()):
+        parts.append(
+            f"There is no coverage of {', '.join(exact)}: the cases have no noise, so their "
+            "intervals are only as wide as rounding errors."
+        )
     if summary["is_random"] and not summary["sensitivities"]:
         parts.append("There are no sensitivities: too few cases have a value, or none changes.")
     return " ".join(parts)
@@ -154,6 +159,7 @@ def _tables(summary: Mapping[str, Any]) -> Iterator[_Table]:
             )
         ] or [(ABSENT, ABSENT, "repeats only")],
     )  # fmt: skip
+    yield from _sensitivities(summary["sensitivities"])
     yield _Table(
         "Results", "Numbers in brackets are intervals of 95 %.",
         ("Result", "Axes", "Cases", "Without a value", "Smallest", "5 %", "Median", "95 %",
@@ -180,7 +186,6 @@ def _tables(summary: Mapping[str, Any]) -> Iterator[_Table]:
     )  # fmt: skip
     yield from _over(summary["over_axes"])
     yield from _along(summary["axis_differences"])
-    yield from _sensitivities(summary["sensitivities"])
     yield _Table(
         "Failed cases",
         "Errors, the most frequent first, with the first case of each. Errors that differ only in "
@@ -199,7 +204,7 @@ def _tables(summary: Mapping[str, Any]) -> Iterator[_Table]:
         "difference is from resampling both; without draws there is none. Cases without a value "
         "are left out, and so are results whose median was not reached. If both campaigns have the "
         "same cases, only those with a value in both count. "
-        f"{_differences(summary.get('differs_in', ()))}",
+        f"{_differences(summary)}",
         ("Result", "Median here", "Median there", "Difference", "Without a value, here and there"),
         [
             (
@@ -215,7 +220,7 @@ def _tables(summary: Mapping[str, Any]) -> Iterator[_Table]:
         f"This campaign minus that in {summary.get('compared_with', '')}. A case has the same "
         "drawn values and random numbers in both, so differences between the devices cancel. "
         "Cases without a finite value in both are left out. "
-        f"{_differences(summary.get('differs_in', ()))}",
+        f"{_differences(summary)}",
         ("Result", "Cases", "Left out", "Smallest difference", "Median difference",
          "Largest difference"),
         [
@@ -347,7 +352,13 @@ def _figures_over(found: Sequence[Mapping[str, Any]]) -> Iterator[str]:
                 yield inline_svg(to_svg(draw_chart(chart), f"axis-{number}", one["result"]))
 
 
-def _differences(changes: Sequence[str]) -> str:
+def _differences(summary: Mapping[str, Any]) -> str:
+    """In what the two campaigns differ."""
+    doubts = [f" About the other campaign: {doubt}." for doubt in summary.get("doubts", ())]
+    return _changed_values(summary.get("differs_in", ())) + "".join(doubts)
+
+
+def _changed_values(changes: Sequence[str]) -> str:
     if not changes:
         return "The two campaign files are equal."
     more = len(changes) - _MOST_CHANGES
@@ -405,7 +416,9 @@ def _with_interval(number: Mapping[str, Any] | None) -> str:
 
 
 def _text(value: float | None) -> str:
-    return "not reached" if value == math.inf else number_text(value)
+    if value is not None and math.isinf(value):
+        return "not reached" if value > 0.0 else "−infinite"
+    return number_text(value)
 
 
 def _shown(value: object) -> str:

@@ -3,13 +3,20 @@
 from __future__ import annotations
 
 import json
+import os
 import shutil
 import sys
+import time
 from pathlib import Path
 
+import pyarrow
+import pyarrow.parquet
 import pytest
 
+from haselab.base import InputError
+from haselab.campaign.folder import read_results
 from haselab.cli.main import main
+from haselab.store.campaign.shards import CaseRow, Shards
 
 QUICK = """
 name = "quick"
@@ -90,6 +97,69 @@ def test_a_comparison_with_itself_finds_no_difference(
     differences = [one["difference"] for one in summary["comparison"]]
     assert differences and all(one["value"] == 0.0 for one in differences)
     assert all(one["ci95"][0] <= 0.0 <= one["ci95"][1] for one in differences)
+
+
+def test_a_comparison_says_why_the_other_folder_may_be_outdated(
+    file: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    file.write_text(f"{QUICK}[design]\nrepeats = 8\n")
+    assert code_of("campaign", file, "--out", "a", "--workers", 1) == 0
+    shutil.copytree("a", "b")
+    compare = ("campaign", file, "--out", "a", "--compare", "b")
+    capsys.readouterr()
+    assert code_of(*compare) == 0
+    assert capsys.readouterr().err == ""
+    # copied without its times: the shards are newer, but the table has their cases
+    later_s = time.time() + 100.0
+    for shard in Path("b/shards").glob("*.parquet"):
+        os.utime(shard, (later_s, later_s))
+    assert code_of(*compare) == 0
+    assert capsys.readouterr().err == ""
+    # cases that were finished after the table
+    writer = Shards(Path("b"), "later")
+    writer.write([CaseRow("new", 3, {"case.gain": 0.4})])
+    assert code_of(*compare) == 0
+    told = "the campaign in b: its table lacks 1 cases that were finished later"
+    assert told in capsys.readouterr().err
+    summary = json.loads(Path("a/summary.json").read_text())
+    assert len(summary["doubts"]) == 1
+    page = Path("a/report.html").read_text()
+    assert "The two campaign files are equal. About the other campaign: its table lacks 1" in page
+    # another version of the code, or an unknown one
+    about = json.loads(Path("b/summary.json").read_text())
+    Path("b/summary.json").write_text(json.dumps({**about, "code": "0.1.0+abc"}))
+    assert code_of(*compare) == 0
+    assert "it was computed by haselab 0.1.0+abc, and this one by" in capsys.readouterr().err
+    Path("b/summary.json").unlink()
+    assert code_of(*compare) == 0
+    assert "its summary.json is missing or unreadable" in capsys.readouterr().err
+
+
+def test_no_flipped_bit_of_the_other_table_gives_other_values(
+    file: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    assert code_of("campaign", file, "--out", "a", "--workers", 1) == 0
+    expected, path = read_results(Path("a")), Path("a/results.parquet")
+    whole = path.read_bytes()
+    for place in range(0, 8 * len(whole), 397):
+        damaged = bytearray(whole)
+        damaged[place // 8] ^= 1 << place % 8
+        path.write_bytes(damaged)
+        with pytest.raises(InputError, match=r"Not a table of a campaign|not the table of summary"):
+            read_results(Path("a"))
+    path.write_bytes(whole)
+    Path("a/summary.json").unlink()  # of a folder of an older version: nothing to compare with
+    assert read_results(Path("a")).keys() == expected.keys()
+
+
+def test_a_foreign_file_among_the_shards_is_refused(
+    file: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    assert code_of("campaign", file, "--out", "a", "--workers", 1) == 0
+    pyarrow.parquet.write_table(pyarrow.table({"x": [1.0]}), "a/shards/x.parquet")
+    capsys.readouterr()
+    assert code_of("campaign", file, "--out", "a", "--workers", 1) == 2
+    assert capsys.readouterr().err.count("\n") == 1
 
 
 def test_two_grids_are_compared_without_intervals_and_an_axis_without_effect_is_named(

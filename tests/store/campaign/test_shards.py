@@ -5,8 +5,12 @@ from __future__ import annotations
 import errno
 import os
 import time
+from collections.abc import Callable
 from pathlib import Path
+from typing import Any
 
+import pyarrow
+import pyarrow.parquet
 import pytest
 
 from haselab.base import InputError
@@ -74,6 +78,86 @@ def test_a_damaged_shard_is_named(tmp_path: Path) -> None:
     file.write_bytes(file.read_bytes()[:-20])
     with pytest.raises(InputError, match=r"Not a shard of a campaign .*Delete the file.*\.parquet"):
         Shards(tmp_path, "b").states()
+
+
+def test_no_flipped_bit_gives_other_values(tmp_path: Path) -> None:
+    """The checksum covers all bytes, so that a flip anywhere is found."""
+    written = [row(index) for index in range(20)]
+    Shards(tmp_path, "a").write(written)
+    (file,) = (tmp_path / "shards").glob("*.parquet")
+    whole = file.read_bytes()
+    for place in range(0, 8 * len(whole), 41):
+        damaged = bytearray(whole)
+        damaged[place // 8] ^= 1 << place % 8
+        file.write_bytes(damaged)
+        for read in (Shards.states, lambda shards: shards.rows(["case-1"], ["case.gain"])):
+            with pytest.raises(InputError, match=r"^Not a shard .*damaged.*Delete the file"):
+                read(Shards(tmp_path, "b"))
+    file.write_bytes(whole)
+    assert len(Shards(tmp_path, "b").states()) == 20
+
+
+def test_a_shard_of_an_older_version_has_no_checksum_and_is_read(tmp_path: Path) -> None:
+    Shards(tmp_path, "a").write([row(0)])
+    (file,) = (tmp_path / "shards").glob("*.parquet")
+    file.rename(file.with_name("host.abcdef01-000001.parquet"))
+    assert Shards(tmp_path, "b").rows(["case-0"], ["case.gain"]) == [row(0)]
+
+
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        (lambda table: table.drop_columns(["case"]), "it has no column 'case'"),
+        (lambda table: table.select(["y"]), "it has no column 'case'"),
+        (
+            lambda table: table.append_column("case", table["case"]),
+            "it has 2 columns 'case'",
+        ),
+        (
+            lambda table: table.set_column(1, "index", table["status"]),
+            "its column 'index' has the type string, not int64",
+        ),
+        (
+            lambda table: table.set_column(0, "case", table["case"].cast("large_string")),
+            "its column 'case' has the type large_string, not string",
+        ),
+        (
+            lambda table: table.set_column(
+                4, "attempt", pyarrow.array([None] * table.num_rows, pyarrow.int64())
+            ),
+            "its column 'attempt' has empty places",
+        ),
+        (
+            lambda table: table.append_column("z", table["status"]),
+            "its column 'z' has the type string, not double",
+        ),
+        (lambda table: table.drop_columns(["case.gain"]), "it has no column 'case.gain'"),
+    ],
+)
+def test_a_foreign_table_among_the_shards_is_refused_in_one_line(
+    tmp_path: Path, change: Callable[[Any], Any], message: str
+) -> None:
+    shards = Shards(tmp_path, "a")
+    shards.write([row(0), row(1)])
+    (file,) = (tmp_path / "shards").glob("*.parquet")
+    foreign = file.with_name("foreign.parquet")
+    pyarrow.parquet.write_table(change(pyarrow.parquet.read_table(file)), foreign)
+    with pytest.raises(InputError, match=rf"^Not a shard of a campaign \({message}\)\. Delete"):
+        reader = Shards(tmp_path, "b")
+        reader.states()
+        reader.rows(["case-0"], ["case.gain"])
+
+
+def test_small_shards_stay_if_one_of_them_is_foreign(tmp_path: Path) -> None:
+    shards = Shards(tmp_path, "a")
+    for index in range(40):
+        shards.write([row(index)])
+    (file, *_) = (tmp_path / "shards").glob("*.parquet")
+    table = pyarrow.parquet.read_table(file)
+    texts = table.set_column(table.column_names.index("y"), "y", table["status"])
+    pyarrow.parquet.write_table(texts, file.with_name("foreign.parquet"))
+    shards.merge()
+    assert len(list((tmp_path / "shards").glob("*.parquet"))) == 41
 
 
 def test_a_claim_excludes_others_until_its_program_releases_it_or_ends(tmp_path: Path) -> None:

@@ -18,24 +18,26 @@ from haselab.campaign.executors.processes import ProcessExecutor
 from haselab.campaign.folder import (
     changes_of,
     described_in,
+    doubts_about,
     finished_rows,
     open_folder,
     plan_of,
     read_results,
+    table_checksum,
     write_table,
 )
+from haselab.campaign.groups import LEAST_CASES, groups_of, result_names
 from haselab.campaign.plan import Plan, Problem
 from haselab.campaign.run import Progressed, run_cases
 from haselab.campaign.summary import (
-    LEAST_CASES,
     compared,
     draws_are_independent,
-    groups_of,
     is_random,
+    most_important,
     paired,
-    result_names,
     share_cases,
     summarised,
+    with_infinities,
 )
 from haselab.campaign.work import compute_case
 from haselab.cli.common import WORKERS, answer_options, progress_bar
@@ -103,6 +105,7 @@ def command(
         raise click.UsageError("Missing option '--out': the folder of the campaign.")
     plan = plan_of(load_campaign(campaign), out)
     there = None if other is None else (read_results(other), described_in(other))
+    doubts = [] if other is None else doubts_about(other, plan.code)
     open_folder(plan, out)
     count = workers or os.cpu_count() or 1
 
@@ -120,13 +123,13 @@ def command(
             f"haselab: {found.outdated:,} finished cases in {out} are of another version of "
             "haselab and were not used", err=True,
         )  # fmt: skip
-    answer = _answer(found)
+    answer, important = _answer(found), ""
     if found.is_complete:
         from haselab.report.campaign_page import campaign_page  # matplotlib is slow to import
 
         rows = finished_rows(plan, out)
         write_table(plan, rows, out)
-        summary = summarised(plan, rows)
+        summary = summarised(plan, rows) | {"table_crc32": table_checksum(out)}
         for path in cast("list[str]", summary["without_effect"]):
             click.echo(
                 f"haselab: warning: no result depends on {path}; the kind "
@@ -145,14 +148,18 @@ def command(
                     f"haselab: No comparison: no result has at least {LEAST_CASES} values and a "
                     f"finite median in both campaigns. {other}", err=True,
                 )  # fmt: skip
+            for doubt in doubts:
+                click.echo(f"haselab: warning: the campaign in {other}: {doubt}", err=True)
             summary |= {
                 "comparison": comparison, "paired": pairs, "compared_with": str(other),
-                "differs_in": changes_of(there[1], plan.campaign.described()),
+                "doubts": doubts, "differs_in": changes_of(there[1], plan.campaign.described()),
             }  # fmt: skip
         write_text(out / "report.html", campaign_page(summary, _values(plan, rows)))
-        answer["summary"] = summary
-        write_json(out / "summary.json", summary)
-    click.echo(json.dumps(to_plain(answer), indent=2) if as_json else "\n".join(_lines(found, out)))
+        answer["summary"] = with_infinities(summary)
+        write_json(out / "summary.json", answer["summary"])
+        important = most_important(summary, rows)
+    lines = _lines(found, out, important)
+    click.echo(json.dumps(to_plain(answer), indent=2) if as_json else "\n".join(lines))
     if found.is_complete and found.failed == found.cases:
         raise ResultError(f"All {found.cases:,} cases failed. See {out / 'failed.txt'}.")
 
@@ -169,8 +176,10 @@ def _compute_one(plan: Plan, index: int, *, as_json: bool) -> None:
         click.echo(row.traceback.rstrip(), err=True)
         raise ResultError(f"Case {index} failed: {row.error}")
     if as_json:
-        found = {"index": index, "parameters": dict(row.values), "results": dict(row.results)}
-        click.echo(json.dumps(to_plain(found), indent=2))
+        found: JsonObject = {
+            "index": index, "parameters": dict(row.values), "results": dict(row.results),
+        }  # fmt: skip
+        click.echo(json.dumps(to_plain(with_infinities(found)), indent=2))
         return
     for name, value in {**row.values, **row.results}.items():
         click.echo(f"{name} = {value:.6g}" if isinstance(value, float) else f"{name} = {value}")
@@ -196,7 +205,7 @@ def _answer(found: Progressed) -> JsonObject:
     }
 
 
-def _lines(found: Progressed, out: Path) -> list[str]:
+def _lines(found: Progressed, out: Path, important: str) -> list[str]:
     lines = [f"{found.done:,} of {found.cases:,} cases have a result, {found.failed:,} failed"]
     if found.computed:
         workers = "1 worker" if found.workers == 1 else f"{found.workers} workers"
@@ -206,4 +215,6 @@ def _lines(found: Progressed, out: Path) -> list[str]:
         )
     if found.elsewhere:
         lines.append(f"{found.elsewhere:,} are being computed by another program")
+    if important:
+        lines.append(important)
     return [*lines, f"written to {out}"]

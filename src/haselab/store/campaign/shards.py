@@ -3,14 +3,20 @@
 A shard is written under a temporary name, synchronised to the disk and renamed, so it is complete
 or absent. Shards are never changed. Small ones are merged: the merged shard is in place before the
 small ones are deleted, and a case that is in several shards counts once.
+
+The name of a shard has a checksum of all its bytes. The checksums of Parquet would not do: they
+leave out the names of the columns. Shards of older versions have no checksum.
 """
 
 from __future__ import annotations
 
 import contextlib
 import importlib
+import io
 import os
+import re
 import secrets
+import zlib
 from collections.abc import Collection, Iterator, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -29,6 +35,9 @@ _SMALL_BYTES = 4_000_000
 _MOST_SMALL = 64
 KEYS = ("case", "index", "status", "error", "attempt", "traceback", "compute_s")
 _STATE = ["case", "status", "attempt"]
+_TYPES = dict(zip(KEYS, ("string", "int64", "string", "string", "int64", "string", "double"),
+                  strict=True))  # fmt: skip
+_CHECKSUM = re.compile(r"\.([0-9a-f]{8})\.parquet")
 
 
 @dataclass(frozen=True)
@@ -128,12 +137,14 @@ class Shards:
             self.merge()
 
     def _save(self, table: Any, name: str) -> None:
-        self._read_names.add(f"{name}{_ENDING}")
+        packed = io.BytesIO()
+        self._parquet.write_table(table, packed, compression="zstd")
+        path = self._folder / f"{name}.{zlib.crc32(packed.getbuffer()):08x}{_ENDING}"
+        self._read_names.add(path.name)
         try:
             self._folder.mkdir(parents=True, exist_ok=True)
-            path = self._folder / f"{name}{_ENDING}"
             with drafted(path) as draft, draft.open("wb") as file:
-                self._parquet.write_table(table, file, compression="zstd")
+                file.write(packed.getbuffer())
                 file.flush()
                 os.fsync(file.fileno())
             _synchronise(self._folder)
@@ -163,7 +174,7 @@ class Shards:
             InputError: a shard is damaged.
         """
         found: dict[str, CaseState] = {}
-        for table in self._tables(_STATE, self._read_names):
+        for table, _ in self._tables(_STATE, self._read_names):
             cases, statuses, attempts = (table.column(name).to_pylist() for name in _STATE)
             if not found.keys() & cases and set(statuses) == {"ok"} and set(attempts) == {1}:
                 found.update(dict.fromkeys(cases, _DONE))  # hundreds of thousands, usually
@@ -186,8 +197,11 @@ class Shards:
             InputError: a shard is damaged.
         """
         wanted, found = frozenset(cases), dict[str, CaseRow]()
-        for table in self._tables(None, set()):
-            for data in table.to_pylist():
+        for table, path in self._tables(None, set()):
+            used = not wanted.isdisjoint(table.column("case").to_pylist())
+            if used and (wrong := self._no_results(table.schema, parameters)):
+                raise _no_shard(path, wrong)
+            for data in table.to_pylist() if used else ():
                 case = data["case"]
                 if case not in wanted:
                     continue
@@ -196,28 +210,47 @@ class Shards:
                     found[case] = row
         return sorted(found.values(), key=lambda row: row.index)
 
-    def _tables(self, columns: list[str] | None, known: set[str]) -> list[Any]:
+    def _tables(self, columns: list[str] | None, known: set[str]) -> list[tuple[Any, Path]]:
         """All shards but the known ones, also while another program merges some of them."""
         while True:
             names = [name for name in self._names() if name not in known]
             try:
-                found = [self._read(self._folder / name, columns) for name in sorted(names)]
+                paths = [self._folder / name for name in sorted(names)]
+                found = [(self._read(path, columns), path) for path in paths]
             except FileNotFoundError:
                 continue
             known.update(names)
             return found
 
     def _read(self, path: Path, columns: list[str] | None) -> Any:
+        data = path.read_bytes()
+        stated = _CHECKSUM.search(path.name)
+        if stated and int(stated[1], 16) != zlib.crc32(data):
+            raise _no_shard(path, "damaged: its checksum differs from that in its name")
         try:
-            with path.open("rb") as file:
-                return self._parquet.ParquetFile(file).read(columns=columns)
-        except (self._arrow.ArrowException, KeyError, OSError) as error:
-            if isinstance(error, OSError) and error.errno is not None:
-                raise  # of the file system, and not of the contents
-            raise InputError(
-                f"Not a shard of a campaign ({' '.join(str(error).split())[:200]}). Delete the "
-                f"file; its cases are then computed again. {path}"
-            ) from None
+            file = self._parquet.ParquetFile(io.BytesIO(data))
+            wrong = _no_keys(file.schema_arrow)
+            table = None if wrong else file.read(columns=columns)
+            if table is not None and not stated:
+                table.validate(full=True)
+        except (self._arrow.ArrowException, KeyError, OSError, ValueError) as error:
+            raise _no_shard(path, " ".join(str(error).split())[:200]) from None
+        if table is None:
+            raise _no_shard(path, wrong)
+        for name in KEYS:
+            if name in table.column_names and table.column(name).null_count:
+                raise _no_shard(path, f"its column {name!r} has empty places")
+        return table
+
+    def _no_results(self, schema: Any, parameters: Collection[str]) -> str:
+        """What is wrong with the columns of parameters and results, or an empty text."""
+        if missing := [name for name in parameters if name not in schema.names]:
+            return f"it has no column {missing[0]!r}"
+        numbers = (self._arrow.float64(), self._arrow.null())
+        for one in schema:
+            if one.name not in (*KEYS, *parameters) and one.type not in numbers:
+                return f"its column {one.name!r} has the type {one.type}, not double"
+        return ""
 
     def _names(self) -> list[str]:
         """Names of all complete shards."""
@@ -240,10 +273,30 @@ class Shards:
             if not locked or len(small) < _MOST_SMALL // 2:
                 return
             tables = [self._read(path, None) for path in small]
-            merged = self._arrow.concat_tables(tables, promote_options="permissive")
+            try:
+                merged = self._arrow.concat_tables(tables, promote_options="permissive")
+            except self._arrow.ArrowException:
+                return  # one of them is no shard of this campaign, see `_no_results`
             self._save(merged, f"{self._writer}-merged-{secrets.token_hex(4)}")
             for path in small:
                 path.unlink()
+
+
+def _no_keys(schema: Any) -> str:
+    """What is wrong with the columns that all shards have, or an empty text."""
+    for name, kind in _TYPES.items():
+        if (count := schema.names.count(name)) != 1:
+            return f"it has {count or 'no'} column{'s' if count else ''} {name!r}"
+        if (found := str(schema.field(name).type)) != kind:
+            return f"its column {name!r} has the type {found}, not {kind}"
+    return ""
+
+
+def _no_shard(path: Path, wrong: str) -> InputError:
+    return InputError(
+        f"Not a shard of a campaign ({wrong}). Delete the file; its cases are then computed "
+        f"again. {path}"
+    )
 
 
 def _row(data: dict[str, Any], parameters: Collection[str]) -> CaseRow:

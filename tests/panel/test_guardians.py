@@ -60,6 +60,72 @@ def test_the_guardians_act_when_the_bench_process_does_not_answer_stop(tmp_path:
             ended(panel)
 
 
+def rig_safe_ends(panel: RunningPanel) -> None:
+    """Wait for the `haselab rig safe` that STOP has started."""
+    words = ["ps", "-o", "args=", "--ppid", str(panel.child("stop_process"))]
+    end_s = time.monotonic() + WAIT_S
+    while "rig safe" in subprocess.run(words, capture_output=True, text=True).stdout:
+        assert time.monotonic() < end_s
+        time.sleep(0.05)
+
+
+def test_a_bench_can_be_armed_again_after_stop_has_reset_its_board(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """As docs/bench/panel.md says in "Reset after STOP"."""
+    rig = tmp_path / "served.toml"
+    with ServedTwin(twin_of_reading("hz"), 1, PACE) as served:
+        limits = "\n[safety]\nmissed_limit = 1000\nlate_limit = 1000\n"  # their clock is the wall's
+        rig.write_text(served.rig_file(ahead_blocks=5) + limits)
+        put_out, is_stopped = [], False
+        set_output = served.hub.set_output
+
+        def noted(drive_v: float) -> None:
+            if is_stopped:
+                put_out.append(drive_v)
+            set_output(drive_v)
+
+        monkeypatch.setattr(served.hub, "set_output", noted)
+        panel = started("--rig", str(rig))
+
+        async def play() -> None:
+            nonlocal is_stopped
+            async with connected(panel) as page:
+                for _ in range(3):
+                    assert "answer" in await page.arm(1.5)
+                    await page.ask("drive", value_v=0.2)
+                    await page.until(lambda state: state["drive_v"] == 0.2)
+                    is_stopped = (await asyncio.to_thread(panel.stop))["commanded"]
+                    assert is_stopped
+                    ending = asyncio.create_task(asyncio.to_thread(rig_safe_ends, panel))
+                    while not ending.done():
+                        await page.receive()
+                    await ending
+                    await page.until(lambda state: state["stage"] == "tripped")
+                    shown_s = page.end_s
+                    async with asyncio.timeout(WAIT_S):
+                        while page.end_s == shown_s:  # frozen
+                            await page.receive()
+                    assert page.state["stage"] == "tripped" and page.state["mode"] == "idle"
+                    assert page.state["reason"].startswith("STOP was pressed")
+                    assert abs(served.hub.output_v) < 50.0
+                    assert "error" in await page.ask("drive", value_v=1.0)
+                    asked = await page.ask("request")
+                    assert "answer" in asked, asked
+                    number = asked["answer"]["number"]
+                    refused = await page.ask("arm", number=number, limit_v=1.5, acknowledged="")
+                    assert "STOP was pressed" in refused["error"]
+                    assert abs(served.hub.output_v) < 50.0
+                    assert set(put_out) == {0.0}, "reopening puts out nothing else"
+                    is_stopped = False
+                    put_out.clear()
+
+        try:
+            asyncio.run(play())
+        finally:
+            ended(panel)
+
+
 STUDY = """name = "one triangle"
 
 [triangle]

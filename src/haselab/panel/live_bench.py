@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import math
 import threading
 import time
@@ -44,6 +45,8 @@ _HEARTBEAT_S = 0.5
 _PICTURES_HZ = 5.0
 _MOST_EVENTS = 40  # that a page shows
 _RECENT = ("arm", "drive", "loop", "open", "confirm")  # an old command could energise the bench
+_SHOWN_DIGITS = 5e-6  # a page shows the limits of the strain with six digits
+_REOPEN_S = 1.0  # between two attempts to open the board again
 _IDLE_BLOCKS = 20  # this many blocks in a row with an unexpected voltage trip the bench
 
 
@@ -110,6 +113,7 @@ class LiveBench:
         self._study = ArmedStudy(rig, self._leases, self._player)
         self._extrapolated = False  # the strain of the last block
         self._unexpected = 0  # blocks in a row with an unexpected voltage
+        self._reopen_s = 0.0  # time of the next attempt to open the board again
         self._over = False  # the panel has ended: commands are refused
         self._events: deque[tuple[float, str]] = deque(maxlen=_MOST_EVENTS)
         rig.bench.on_block = self._on_block
@@ -367,7 +371,8 @@ class LiveBench:
                 "with both maps and a controller (haselab design A.toml)."
             )
         strain, limits = number(values, "strain"), self._loop.saturation
-        if not limits.low <= strain <= limits.high:
+        slack = _SHOWN_DIGITS * max(abs(limits.low), abs(limits.high))
+        if not limits.low - slack <= strain <= limits.high + slack:
             raise LimitError(
                 f"The desired strain is {100.0 * strain:.6g} %, but the limits of the controller "
                 f"are {100.0 * limits.low:.6g} to {100.0 * limits.high:.6g} %. Choose another one."
@@ -382,7 +387,7 @@ class LiveBench:
             carrier = (CARRIER_HZ, CARRIER_V)
             self._closed = ClosedLoop(self._rig, _NoCamera(), carrier, self._loop, "panel")
             self._mode = "loop"
-        self._reference = strain
+        self._reference = min(max(strain, limits.low), limits.high)
         return {}
 
     def _open_loop(self, holder: str, values: JsonObject) -> JsonObject:
@@ -461,11 +466,20 @@ class LiveBench:
     def _failed(self, error: HaselabError) -> None:
         if not self._holder:
             self._reason = str(error)
+            self._reopen()
             time.sleep(self._rig.description.block_s)
             return
         if not isinstance(error, SafetyError):
             self._rig.safety.trip(str(error))
         self._end(self._rig.safety.reason or str(error))
+
+    def _reopen(self) -> None:
+        """Open the board again at 0 V: `haselab rig safe`, which STOP starts, has reset it."""
+        if time.monotonic() < self._reopen_s or self._rig.safety.stage in LIVE:
+            return
+        with contextlib.suppress(Exception):  # the next block says why it still fails
+            self._rig.reopen()
+        self._reopen_s = time.monotonic() + _REOPEN_S
 
     def _play(self, job: StudyJob) -> None:
         """Play a study, and end at 0 V."""

@@ -27,6 +27,7 @@ __all__ = [
     "PartialImage",
     "PreloadsOutputs",
     "ReferenceFixture",
+    "Reopens",
     "ReportsOutput",
     "ReportsOutputState",
     "Rig",
@@ -245,6 +246,20 @@ class GaplessAcquisition(Protocol):
 
         Raises:
             DeviceError: The instrument does not reply.
+        """
+
+
+@runtime_checkable
+class Reopens(Protocol):
+    """An acquisition that can be opened again after another program has reset its device."""
+
+    def reopen(self) -> None:
+        """Open the device again at 0 V, without any earlier request; its clock begins at 0 s.
+
+        It is only called while the bench is not armed, and must not apply a voltage.
+
+        Raises:
+            DeviceError: The device does not reply, or another program uses it.
         """
 
 

@@ -41,7 +41,7 @@ _TURN_S = 0.25  # longest such wait; after it the call is made anyway
 _FORGETS = ("zero", "off")  # after these a driver has no earlier request left
 # Calls that request nothing themselves, but in which a driver may put out an earlier request:
 # reading a block starts a stream, pausing one writes its last value.
-_PASSIVE = frozenset({"read", "keep", "pause", "catch_up", "pass_time", "read_back"})
+_PASSIVE = frozenset({"read", "keep", "pause", "catch_up", "pass_time", "read_back", "reopen"})
 # Calls that request an output, with their arguments; the last one is the amount.
 _REQUESTS = {
     "write": ("voltage_v",),

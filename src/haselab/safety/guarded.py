@@ -9,8 +9,8 @@ from collections.abc import Callable
 import numpy as np
 from numpy.typing import NDArray
 
-from haselab.base import DeviceError, InputError
-from haselab.rig import Rig
+from haselab.base import DeviceError, InputError, SafetyError
+from haselab.rig import Reopens, Rig
 from haselab.safety.arming_text import arming_limits
 from haselab.safety.gate import Gate
 from haselab.safety.guarded_parts import (
@@ -24,7 +24,7 @@ from haselab.safety.guarded_parts import (
 )
 from haselab.safety.instrument_state import instrument_states, output_state
 from haselab.safety.shutdown import ReadBack, Shutdown
-from haselab.safety.state_machine import Safety, SafetySettings
+from haselab.safety.state_machine import LIVE, Safety, SafetySettings
 from haselab.safety.watchdog.deadlines import Deadlines
 
 __all__ = ["GuardedRig", "guard"]
@@ -135,6 +135,23 @@ class GuardedRig(Rig):
                 f"The output cannot be read: {found.unreachable if found else 'no meter'}"
             )
         return abs(found.voltage_v)
+
+    def reopen(self) -> None:
+        """Open the board again after another program has reset it; the output stays at 0 V.
+
+        Nothing is energised: the latch and the guardians stay as they are. A board that cannot be
+        opened again is left as it is.
+
+        Raises:
+            SafetyError: The bench is armed, or another program is making it safe.
+            DeviceError: The board does not reply, or another program uses it.
+        """
+        if self.safety.stage in LIVE:
+            raise SafetyError(f"The bench is {self.safety.stage.value}. Disarm it first.")
+        board = self.plain.acquisition
+        if isinstance(board, Reopens):
+            board.reopen()
+            self.bench.reopened()
 
     def safe(self) -> None:
         """Take the output to 0 V, stop sensing signal and camera, and read 0 V back.

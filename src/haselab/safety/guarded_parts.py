@@ -123,6 +123,12 @@ class GuardedBench:
         self.present_drive_v = self.requested_v
         self.watch.rest(self.requested_v)
 
+    def reopened(self) -> None:
+        """Note that the board was opened again: it is at 0 V, and its clock begins at 0 s."""
+        self.requested_v = 0.0
+        self.time_s = self.moved_s = 0.0
+        self.passed()
+
 
 class _Part:
     """Base of the guarded instruments, which offer the calls of their protocol and no others."""

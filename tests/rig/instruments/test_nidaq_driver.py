@@ -179,6 +179,33 @@ def test_a_buffer_that_is_full_after_a_reset_says_to_start_again(code: int) -> N
             raise error
 
 
+def test_a_board_that_was_reset_opens_again_at_zero_without_a_permission() -> None:
+    """Its clock begins at 0 s, and nothing that was requested before is put out."""
+    with served_board() as (served, file), opened(file, LINE) as board:
+        log = board.exposures
+        board.keep(True)
+        board.write(0.5)
+        for _ in range(3):
+            board.read()
+        assert served.hub._drive_v == 0.5
+        other = NidaqLink(file.daq)
+        other.reset()  # as `haselab rig safe` does
+        other.close()
+        with pytest.raises(DeviceError, match="NI board"):
+            board.read()
+        Gate().instrument(board).reopen()
+        assert board.exposures is log, "the camera reads it"
+        board.write(0.0)
+        for _ in range(3):
+            board.read()
+            assert served.hub._drive_v == 0.0
+        assert 0.0 < board.time_s < 1.0
+        board.write(0.5)
+        for _ in range(3):
+            board.read()
+        assert served.hub._drive_v == 0.5
+
+
 # ---- USB ----------------------------------------------------------------------------------------
 
 

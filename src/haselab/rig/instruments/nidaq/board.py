@@ -69,18 +69,10 @@ class NidaqBoard:
         self._monitor_gain = monitor_gain
         self._volts = np.empty((2, config.block_samples))
         self._one = np.empty((2, 1))
-        self._requested_v = 0.0  # of the last write
-        self._queued_v = 0.0  # last value that was written to the device
         self._coming: deque[float] = deque()  # known values of later blocks
         self._early: deque[float] = deque()  # values that were written before their block was read
-        self._silent_until = 0  # outputs of blocks before this sample came too late
         self.missed_outputs = 0
-        self.fetched_s = 0.0  # end of the last fetched block; `time_s` may be later
-        self._position = 0  # samples read or skipped since the start
-        self._place = 0  # position at which the driver continues to read
-        self._offset = 0  # offset that it adds
-        self._kept = False
-        self._streaming = False
+        self._exposure = exposure
         self._exposures: ExposureCounter | None = None
         self._idle: IdlePoll | None = None
         self._link = link or NidaqLink(config)
@@ -88,8 +80,6 @@ class NidaqBoard:
             self._link.check_serial()
             self._tasks = NidaqTasks(self._link, config)
             with self._link.translated_errors():
-                if exposure is not None:
-                    self._exposures = ExposureCounter(self._link, config, exposure)
                 self._open()
         except BaseException:
             self._link.close()
@@ -99,6 +89,18 @@ class NidaqBoard:
     # ---- opening and closing -------------------------------------------------------------------
 
     def _open(self) -> None:
+        self._requested_v = 0.0  # of the last write
+        self._queued_v = 0.0  # last value that was written to the device
+        self._silent_until = 0  # outputs of blocks before this sample came too late
+        self.fetched_s = 0.0  # end of the last fetched block; `time_s` may be later
+        self._position = 0  # samples read or skipped since the start
+        self._place = 0  # position at which the driver continues to read
+        self._offset = 0  # offset that it adds
+        self._kept = self._streaming = False
+        self._forget()
+        if self._exposure is not None:
+            log = self.exposures  # which the camera reads
+            self._exposures = ExposureCounter(self._link, self._config, self._exposure, log)
         self._static = self._tasks.output()
         self._at_once = self._link.writer(self._static, auto_start=True)
         self._put_out(0.0)
@@ -115,6 +117,14 @@ class NidaqBoard:
         self._inputs.start()
         if self._link.usb:
             self._idle = IdlePoll(self._query_idle)
+
+    def reopen(self) -> None:
+        """See `haselab.rig.Reopens`: makes all tasks again; the first one puts out 0 V."""
+        if self._idle is not None:
+            self._idle.close()
+        self._link.close_tasks()
+        with self._link.translated_errors():
+            self._open()
 
     def close(self) -> None:
         """Go to 0 V, then close the board. Never raises."""

@@ -33,12 +33,20 @@ class ExposureCounter:
         link: to the board.
         daq: section `daq` of the rig file.
         exposure: section `exposure`.
+        log: to continue with after the board was opened again; None: a new one.
     Raises:
         InputError: The sample rate does not divide the timebase.
     """
 
-    def __init__(self, link: NidaqLink, daq: NidaqConfig, exposure: ExposureConfig) -> None:
-        self.log = ExposureLog(_TICK_S)
+    def __init__(
+        self,
+        link: NidaqLink,
+        daq: NidaqConfig,
+        exposure: ExposureConfig,
+        log: ExposureLog | None = None,
+    ) -> None:
+        self.log = log or ExposureLog(_TICK_S)
+        self.log.forget()
         self._daq = daq
         self._half_s = 0.5 * exposure.duration_s
         self._start_s = 0.0  # from the start trigger to the first sample

@@ -107,7 +107,7 @@ class NidaqLink:
 
     def __init__(self, config: NidaqConfig) -> None:
         self._config = config
-        self._stack = contextlib.ExitStack()
+        self._stack, self._tasks = contextlib.ExitStack(), contextlib.ExitStack()
         self._nidaqmx = load_driver("nidaqmx", "The NI board")
         self.constants = load_driver("nidaqmx.constants", "The NI board")
         self._errors = load_driver("nidaqmx.errors", "The NI board")
@@ -176,7 +176,7 @@ class NidaqLink:
     def task(self) -> Any:
         """Create a task, which is closed with the link."""
         task = self._nidaqmx.Task(**self._options(""))
-        self._stack.callback(quietly, task.close)
+        self._tasks.callback(quietly, task.close)
         return task
 
     def reader(self, task: Any) -> Any:
@@ -231,7 +231,12 @@ class NidaqLink:
 
     def close(self) -> None:
         """Close tasks and connection. Never raises."""
+        self.close_tasks()
         self._stack.close()
+
+    def close_tasks(self) -> None:
+        """Close all tasks; the connection stays. Never raises."""
+        self._tasks.close()
 
     @contextlib.contextmanager
     def translated_errors(self) -> Iterator[None]:

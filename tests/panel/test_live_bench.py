@@ -8,17 +8,20 @@ import time
 from collections.abc import Callable, Iterator
 from dataclasses import replace
 from pathlib import Path
-from typing import Any
+from types import SimpleNamespace
+from typing import Any, cast
 
 import numpy as np
 import pytest
 
 from haselab.api.design import Actuator
-from haselab.base import SafetyError
+from haselab.base import DeviceError, LimitError, Limits, SafetyError
 from haselab.panel import study_player
+from haselab.panel.armed_study import ArmedStudy
 from haselab.panel.columns import LiveReader, LiveWriter
 from haselab.panel.files import PanelFiles
 from haselab.panel.live_bench import LiveBench
+from haselab.panel.page_leases import PageLeases
 from haselab.panel.pages.study_job import StudyJob
 from haselab.rig.rig_file import load_rig
 from haselab.rig.twin.config import twin_of_reading
@@ -389,3 +392,50 @@ def test_a_camera_of_the_twin_that_is_stopped_during_a_call_gives_no_frame() -> 
         bench.read()
     bench._frame_rate_hz = 0.0  # the first thing that `stop` does
     assert bench.take() is None
+
+
+@pytest.mark.parametrize("limit", [-0.011, 0.006, 0.0130000049, 0.0129999951])
+def test_a_strain_at_a_limit_as_the_page_shows_it_is_accepted(
+    tmp_path: Path, actuator_file: Path, limit: float
+) -> None:
+    """The page shows percents with six digits, and divides what is typed by 100."""
+    loop = Actuator.load(actuator_file).loop()
+    saturation = replace(loop.saturation, low=min(limit, 0.0), high=max(limit, 0.0))
+    loop = replace(loop, saturation=saturation)
+    rig = guard(make_twin(twin_of_reading("hz"), 1))
+    about = rig.description
+    with LiveWriter(tmp_path / "live", about.rate_hz, about.block_samples, (1.0, 1.0)) as writer:
+        live = LiveBench(rig, writer, lambda: loop)
+        number = live.do("request", "page", {})["number"]
+        live.do("arm", "page", {"number": number, "limit_v": 2.0})
+        live.do("loop", "page", {"strain": float(f"{100.0 * limit:.6g}") / 100.0})
+        reference = live.state.reference
+        assert reference is not None and 0.0 <= reference / limit <= 1.0
+        assert reference == pytest.approx(limit, rel=1e-5)
+        with pytest.raises(LimitError, match="The desired strain is"):
+            live.do("loop", "page", {"strain": 1.0001 * limit})
+        live.close()
+
+
+def test_a_limit_of_the_board_that_was_not_narrowed_keeps_its_source() -> None:
+    board = Limits("drive", 0.0, 2.0, "V", low_source="rig.toml", high_source="rig.toml")
+    found = study_player._within(board, 1.5)
+    assert (found.low, found.high, found.low_source) == (0.0, 1.5, "rig.toml")
+    assert found.high_source == "the limit typed on the page"
+    assert study_player._within(board, 2.0) == board
+
+
+@pytest.mark.parametrize("is_there", [True, False])
+def test_a_study_names_its_recording_only_if_it_is_still_there(
+    tmp_path: Path, is_there: bool
+) -> None:
+    def play(*_: object) -> None:
+        raise DeviceError("A disk.")
+
+    if is_there:
+        (tmp_path / "session.h5").touch()
+    rig: Any = SimpleNamespace(safety=SimpleNamespace(live=False, record_with=lambda note: None))
+    study = ArmedStudy(rig, PageLeases(1.0), cast(Any, SimpleNamespace(play=play)))
+    job: Any = SimpleNamespace(options=SimpleNamespace(folder=tmp_path))
+    said = study.play(job, 1.0, None)
+    assert said == "A disk." + f" The data recorded so far are in {tmp_path}." * is_there

@@ -71,7 +71,7 @@ def test_stop_acts_when_the_pointer_goes_down(page: Page) -> None:
     page.mouse.move(box["x"] + 20, box["y"] + 20)
     page.mouse.down()  # and not up
     expect(page.locator("#emergency-state")).to_contain_text(
-        "STOP: 0 V commanded at ", timeout=WAIT_MS
+        re.compile(r"STOP: 0 V commanded at \d\d:\d\d:\d\d$"), timeout=WAIT_MS
     )
     expect(page.locator("header")).to_contain_text("Bench: tripped", timeout=WAIT_MS)
     page.mouse.up()
@@ -115,6 +115,12 @@ def test_a_typed_drive_needs_enter_and_a_refused_one_is_not_shown(page: Page) ->
     expect(page.locator("header")).to_contain_text(
         re.compile(r"running, 0\.500 V"), timeout=WAIT_MS
     )
+    box.fill("1.9")
+    box.press("Enter")
+    expect(page.get_by_role("alert")).to_contain_text("armed for 0 to 1.5 V", timeout=WAIT_MS)
+    page.keyboard.press("Escape")  # STOP, whose reason is then shown alone
+    expect(page.get_by_text("Last message of the bench: STOP")).to_be_visible(timeout=WAIT_MS)
+    expect(page.get_by_role("alert")).to_have_count(0)
 
 
 def test_an_old_picture_has_no_reason_that_is_not_true(page: Page) -> None:
@@ -202,6 +208,17 @@ def test_frozen_data_look_frozen_and_come_back(page: Page, panel: RunningPanel) 
         os.kill(panel.process.pid, signal.SIGCONT)
     expect(page.locator("#age")).to_have_text("data live", timeout=WAIT_MS)
     assert not page.evaluate("document.body.classList.contains('stale')")
+
+
+@pytest.mark.slow
+def test_a_page_connects_again_after_a_long_outage(page: Page, panel: RunningPanel) -> None:
+    """Chromium delays new connections of a page after about 30 failed ones."""
+    os.kill(panel.process.pid, signal.SIGSTOP)
+    try:
+        time.sleep(40.0)
+    finally:
+        os.kill(panel.process.pid, signal.SIGCONT)
+    expect(page.locator("#age")).to_have_text("data live", timeout=WAIT_MS)
 
 
 def test_a_frozen_bench_looks_frozen_too(page: Page, panel: RunningPanel) -> None:

@@ -79,7 +79,8 @@ class ArmedStudy:
             self.player.play(job, self._rig, limit_v, self.why_not, picture)
             self.recorded = folder.name
         except HaselabError as error:
-            kept = f" The data recorded so far are in {folder}." if folder.is_dir() else ""
+            is_kept = (folder / "session.h5").is_file()  # unless somebody has deleted it
+            kept = f" The data recorded so far are in {folder}." if is_kept else ""
             return f"{error}{kept}"
         except OSError as error:
             return self._tripped(_unwritable(error, folder))

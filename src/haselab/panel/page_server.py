@@ -10,6 +10,7 @@ import json
 import secrets
 import signal
 import socket
+import sys
 from collections.abc import Callable, Generator, Iterator, Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -281,6 +282,9 @@ def _bound(port: int, ips: tuple[str, ...]) -> list[socket.socket]:
         listeners: list[socket.socket] = []
         for ip in ips:
             listener = opened.enter_context(socket.socket())
+            if sys.platform != "win32":  # where it would share the port with another program
+                # A port can be used again at once after a panel ended with a page open.
+                listener.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
             listener.bind((ip, port))
             listener.listen(128)  # a browser that is early waits
             port = listener.getsockname()[1]

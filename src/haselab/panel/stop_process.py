@@ -48,6 +48,7 @@ class StopServer(ThreadingHTTPServer):
         ip: address of this computer on which it serves.
     """
 
+    allow_reuse_address = sys.platform != "win32"
     daemon_threads = True
     request_queue_size = 128
 

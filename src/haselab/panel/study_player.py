@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import contextlib
+import os
 import threading
 import time
 from collections.abc import Callable
@@ -20,6 +21,7 @@ from haselab.rig import Camera
 from haselab.rig.cameras.source import KnownCamera
 from haselab.rig.protocols import Frames
 from haselab.safety.guarded import GuardedRig
+from haselab.safety.interlock import lease_clock_s
 from haselab.study.run import run_study
 
 __all__ = ["FilmedCamera", "PictureFile", "StudyEndedError", "StudyPlayer"]
@@ -36,7 +38,8 @@ class PictureFile:
     """A JPEG file of the last frame, which a reader never sees half-written.
 
     A thread writes it, so that a picture never delays an output. Frames that arrive meanwhile are
-    dropped. If the disk is full, the page keeps the previous picture.
+    dropped. If the disk is full, the page keeps the previous picture. The time of the file is that
+    of `lease_clock_s`.
 
     Args:
         path: of the file.
@@ -50,12 +53,14 @@ class PictureFile:
     def save(self, frames: Frames) -> None:
         """Save the last of some frames, at least one."""
         if self._last is None or self._last.done():
-            self._last = self._writer.submit(self._save, frames.image(len(frames.time_s) - 1))
+            image = frames.image(len(frames.time_s) - 1)
+            self._last = self._writer.submit(self._save, image, lease_clock_s())
 
-    def _save(self, image: NDArray[np.uint8]) -> None:
+    def _save(self, image: NDArray[np.uint8], taken_s: float) -> None:
         new = self._path.with_suffix(".new")
         with contextlib.suppress(OSError):
             Image.fromarray(image).save(new, "JPEG", quality=80)
+            os.utime(new, (taken_s, taken_s))  # not the wall clock, which can be set
             new.replace(self._path)
 
 
@@ -185,7 +190,9 @@ class StudyPlayer:
 
 
 def _within(limits: Limits, limit_v: float) -> Limits:
-    source = "the limit typed on the page"
-    high = min(limits.high, limit_v)
-    low = max(limits.low, -limit_v)
-    return replace(limits, low=low, high=high, low_source=source, high_source=source)
+    typed = "the limit typed on the page"
+    if limit_v < limits.high:
+        limits = replace(limits, high=limit_v, high_source=typed)
+    if -limit_v > limits.low:
+        limits = replace(limits, low=-limit_v, low_source=typed)
+    return limits

@@ -169,6 +169,7 @@ def write_section(
     values: Mapping[str, object],
     provenance: Provenance | None,
     owned: Collection[str] = (),
+    sha256: str = "",
 ) -> None:
     """Write one section of an actuator file, and keep everything else.
 
@@ -179,8 +180,9 @@ def write_section(
         provenance: written to `[provenance.SECTION]`; None: not written.
         owned: keys that are removed from the section if `values` lacks them. Other keys and all
             comments are kept.
+        sha256: of the file from which the values were computed; empty: it is not checked.
     Raises:
-        InputError: the file cannot be read, is read-only, or a section is not a table.
+        InputError: the file cannot be read, is read-only, has changed, or a section is not a table.
         DeviceError: the file cannot be written.
     """
     read_actuator(path)  # TOML of a bounded depth
@@ -189,7 +191,13 @@ def write_section(
     if provenance is not None:
         origin = provenance.table()
         changes[f"provenance.{section}"] = (origin, list(origin))
-    write_text(path.resolve(), _changed(read_text(path, "actuator file"), changes, path))
+    text = _changed(read_text(path, "actuator file"), changes, path)
+    if sha256 and sha256_of(path) != sha256:
+        raise InputError(
+            f"Not written: the actuator file has changed since [{section}] was computed from it. "
+            f"Check what has changed, then write again. {path}"
+        )
+    write_text(path.resolve(), text)
 
 
 def write_sections(

@@ -16,6 +16,7 @@ from haselab.base import HaselabError, InputError, ResultError, to_plain
 from haselab.cli.main import main
 from haselab.controllers import CONTROLLERS, ControllerKind, Parameter
 from haselab.panel.files import PanelFiles
+from haselab.panel.pages import design
 from haselab.panel.pages.requests import REQUESTS
 from tests.panel.running import connected, ended, started
 
@@ -425,3 +426,21 @@ def test_the_bench_uses_written_gains_from_the_next_arming_on(path: Path) -> Non
         asyncio.run(play())
     finally:
         assert ended(panel) == 0
+
+
+def test_a_file_that_changes_while_it_is_written_keeps_the_change(
+    path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Computing what is written takes a second, in which another program may write."""
+    sha256, compute = ask(path, "design-loop", **GAINS)["sha256"], design._design
+    changed = path.read_text().replace("gain = 0.8", "gain = 1.6")
+
+    def meanwhile(*given: Any) -> Any:
+        found = compute(*given)
+        path.write_text(changed)
+        return found
+
+    monkeypatch.setattr(design, "_design", meanwhile)
+    with pytest.raises(InputError, match="Not written: the actuator file has changed since"):
+        ask(path, "design-write", **GAINS, sha256=sha256)
+    assert path.read_text() == changed

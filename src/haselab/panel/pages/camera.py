@@ -15,6 +15,7 @@ from PIL import Image
 
 from haselab.base import InputError, ResultError
 from haselab.runtime.observer import FIDUCIALS
+from haselab.safety.interlock import lease_clock_s
 from haselab.tracking import PointTracker, TrackOptions, TrackState, detect_fiducials
 from haselab.tracking.options import Floats, Frame
 
@@ -30,7 +31,7 @@ class Picture(NamedTuple):
 
     Args:
         jpeg: the frame.
-        age_s: since it was taken.
+        age_s: since it was taken; infinite if this is not known.
         fiducials: `size` of the frame in px, and `points` with the position `x, y` of each fiducial
             and its position in the first frame, without those that are lost. As JSON.
     """
@@ -44,7 +45,7 @@ class CameraPicture:
     """Reads the last frame and tracks the fiducials in it, once for all pages.
 
     Args:
-        path: of the JPEG file that the bench process writes.
+        path: of the JPEG file that the bench process writes, see `PictureFile`.
     """
 
     def __init__(self, path: Path) -> None:
@@ -70,7 +71,8 @@ class CameraPicture:
                     self._taken_s = taken_s
             except OSError:
                 return None
-            return Picture(self._jpeg, max(time.time() - taken_s, 0.0), self._found)
+            age_s = lease_clock_s() - taken_s
+            return Picture(self._jpeg, age_s if age_s >= 0.0 else math.inf, self._found)
 
     def _follow(self, later_s: float) -> None:
         """Track the fiducials; the first frame after a pause is the one to compare with."""

@@ -340,8 +340,9 @@ def _write(files: PanelFiles, values: JsonObject) -> JsonObject:
     section["name"] = name or None
     section["alternatives"] = other_controllers(loop.path, name or kind) or None
     command = f"haselab panel --actuator {shlex.quote(str(files.actuator))} # page Design"
-    origin = Provenance(command, hashed([loop.path]), datetime.now(UTC), __version__)
-    write_section(loop.path, "controller", section, origin, CONTROLLER_KEYS)
+    inputs = {loop.path.name: loop.sha256}
+    origin = Provenance(command, inputs, datetime.now(UTC), __version__)
+    write_section(loop.path, "controller", section, origin, CONTROLLER_KEYS, loop.sha256)
     return {"written": str(loop.path)}
 
 

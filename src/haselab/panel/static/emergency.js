@@ -33,7 +33,7 @@
     try {
       const answer = await fetch(`${address}/stop`, { method: "POST", keepalive: true, signal: AbortSignal.timeout(ANSWER_MS) });
       const found = await answer.json();
-      show(found.commanded ? `STOP: 0 V commanded at ${new Date().toLocaleTimeString()}` : "THE BENCH PROCESS DOES NOT ANSWER. Press the emergency stop of the bench.", !found.commanded);
+      show(found.commanded ? `STOP: 0 V commanded at ${new Date().toTimeString().slice(0, 8)}` : "THE BENCH PROCESS DOES NOT ANSWER. Press the emergency stop of the bench.", !found.commanded);
     } catch {
       show("STOP DOES NOT ANSWER. Press the emergency stop of the bench.", true);
     }

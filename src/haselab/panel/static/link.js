@@ -3,6 +3,7 @@ import { Requests } from "/static/requests.js";
 
 const SCHEMA = 1;
 const SILENT_MS = 900; // without a frame the connection is opened again
+const PATIENCE_MS = 20000; // longest wait for a connection: Chromium delays new ones after failures
 
 export class Link extends Requests {
   constructor(onFrame, onChange) {
@@ -15,6 +16,7 @@ export class Link extends Requests {
     this.framedAt = -Infinity;
     this.blockAge = 0; // when the last frame was sent, in s
     this.clock = 0; // of the bench process in the last frame, in s; the process refuses commands with an old time
+    this.patience = SILENT_MS; // with a socket that is connecting
     this.waiting = new Map();
     this.number = 0;
     this.open();
@@ -27,12 +29,17 @@ export class Link extends Requests {
 
   get silent_ms() { return performance.now() - this.framedAt; }
 
+  get wait_ms() { return this.socket.readyState === WebSocket.CONNECTING ? this.patience : SILENT_MS; }
+
   open() {
     const socket = new WebSocket(`ws://${location.host}/live`);
     this.socket = socket;
     this.openedAt = performance.now();
     socket.binaryType = "arraybuffer";
-    socket.onopen = () => socket.send(JSON.stringify({ token: this.token }));
+    socket.onopen = () => {
+      if (socket === this.socket) this.openedAt = performance.now();
+      socket.send(JSON.stringify({ token: this.token }));
+    };
     socket.onmessage = ({ data }) => {
       if (socket !== this.socket) return; // an old connection: its frames are old
       if (typeof data === "string") this.heard(JSON.parse(data));
@@ -56,8 +63,9 @@ export class Link extends Requests {
     const since = performance.now() - this.openedAt;
     if (this.socket === null) {
       if (since > 400 && !this.problem) this.open();
-    } else if (this.silent_ms > SILENT_MS && since > SILENT_MS) {
+    } else if (this.silent_ms > SILENT_MS && since > this.wait_ms) {
       const old = this.socket;
+      if (old.readyState === WebSocket.CONNECTING) this.patience = Math.min(2 * this.patience, PATIENCE_MS);
       this.socket = null; // also when the old one never closes
       old.close();
       this.lost();
@@ -98,6 +106,7 @@ export class Link extends Requests {
       signals.high.push(part(4 * columns + (5 + k) * rows, rows));
     }
     this.framedAt = performance.now();
+    this.patience = SILENT_MS;
     this.blockAge = about.age_s;
     this.clock = about.clock_s;
     this.send({ ack: number });

@@ -104,7 +104,7 @@ function Camera({ filming }) {
     }
     look();
   }, []);
-  const old = !(seen.age_s < 1), { points, size } = seen;
+  const old = !filming || !(seen.age_s < 1), { points, size } = seen;
   const moved = Math.max(...points.map(([x, y, x0, y0]) => Math.hypot(x - x0, y - y0)));
   return html`<div class="card"><h2>Camera</h2>
     ${seen.url ? html`<div class=${`frame seen ${old ? "old" : ""}`}><img src=${seen.url} alt="Actuator in the last frame of the camera" />
@@ -146,6 +146,8 @@ function Panel() {
   const age = Number.isFinite(seconds) ? `NO NEW DATA for ${seconds.toFixed(1)} s` : "NO DATA YET";
   const live = state !== null && state.holder !== "";
   const mine = live && state.holder === link.holder;
+  const tripped = state?.stage === "tripped";
+  useEffect(() => { if (tripped) say(""); }, [tripped]); // the reason of the trip is shown instead
   const paused = link.view.end_s !== null;
   const jumped = typeof frame?.gap_s === "number" && frame.gap_s > (link.view.end_s ?? frame.end_s) - link.view.span_s;
   return html`

@@ -114,7 +114,7 @@ def test_a_new_file_gives_a_page_of_commands(
     missing = answer["missing"]
     assert isinstance(missing, dict)
     assert set(missing) == {
-        "sensing", "sensing.strain_map", "drive.voltage_map", "model", "controller"
+        "sensing.scale_s", "sensing.strain_map", "drive.voltage_map", "model", "controller"
     }  # fmt: skip
     assert "No command has written to this file" in out.read_text()
 

@@ -220,6 +220,10 @@ class LiveBench:
 
     def _request_arming(self, holder: str, values: JsonObject) -> JsonObject:
         self._require_idle()
+        guardians = self._rig.safety.guardians
+        if guardians is not None and guardians.lost():  # for example, they have acted after STOP
+            guardians.close()
+            guardians.start()
         self._request, self._requester = self._rig.safety.request(), holder
         output_v_per_s = _RAMP_V_PER_S * self._rig.description.amplifier_gain
         manual = (

@@ -75,8 +75,7 @@ def test_a_bench_can_be_armed_again_after_stop_has_reset_its_board(
     """As docs/bench/panel.md says in "Reset after STOP"."""
     rig = tmp_path / "served.toml"
     with ServedTwin(twin_of_reading("hz"), 1, PACE) as served:
-        limits = "\n[safety]\nmissed_limit = 1000\nlate_limit = 1000\n"  # their clock is the wall's
-        rig.write_text(served.rig_file(ahead_blocks=5) + limits)
+        rig.write_text(served.rig_file(ahead_blocks=5) + PATIENT)
         put_out, is_stopped = [], False
         set_output = served.hub.set_output
 
@@ -139,6 +138,7 @@ skipped_cycles = 1
 frame_rate_hz = 200.0
 """
 PACE = 0.2  # of the wall clock, so that a busy machine queues its outputs in time
+PATIENT = "\n[safety]\nmissed_limit = 1000\nlate_limit = 1000\n"  # their clock is the wall's
 
 
 def test_blocks_that_pass_while_a_bench_is_armed_are_not_a_gap(
@@ -185,8 +185,7 @@ def test_new_guardians_watch_after_the_first_ones_have_acted(tmp_path: Path) -> 
     """Guardians end when they have acted; the bench could then not be armed again."""
     rig = tmp_path / "served.toml"
     with ServedTwin(twin_of_reading("hz"), 1, PACE) as served:
-        limits = "\n[safety]\nmissed_limit = 1000\nlate_limit = 1000\n"
-        rig.write_text(served.rig_file(ahead_blocks=5) + limits)
+        rig.write_text(served.rig_file(ahead_blocks=5) + PATIENT)
         panel = started("--rig", str(rig))
         bench = panel.child("bench_process")
 

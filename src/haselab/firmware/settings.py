@@ -226,8 +226,8 @@ class ChipSettings:
         table, slack_v = self.table_v, _SINGLE * self.drive_high_v
         table = table if self.rises else table[::-1]
         ends_v = table[0] + slack_v, table[-1] - slack_v
+        zero_v = _core.voltage_from_strain(*self.voltage_map, 0.0)
         if not (np.diff(table) > 0.0).all() or ends_v[0] < 0.0 or ends_v[1] > self.drive_high_v:
-            zero_v = _core.voltage_from_strain(*self.voltage_map, 0.0)
             if zero_v > self.drive_high_v:
                 raise InputError(
                     f"A loop starts at zero strain, which needs {zero_v:.4g} V by the voltage map, "
@@ -247,9 +247,8 @@ class ChipSettings:
             raise InputError(
                 f"The highest drive, {max(self.table_v):.4g} V, gives a strain of "
                 f"{self.strain_high if self.rises else self.strain_low:.3g}, but a loop starts at "
-                f"zero strain, which needs {_core.voltage_from_strain(*self.voltage_map, 0.0):.4g} "
-                "V. Raise high_v in [drive] or drive_high_v of the rig, or widen the limits of "
-                "[controller]."
+                f"zero strain, which needs {zero_v:.4g} V. Raise high_v in [drive] or drive_high_v "
+                "of the rig, or widen the limits of [controller]."
             )
 
     def _check_front_end(self) -> None:

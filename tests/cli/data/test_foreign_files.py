@@ -512,14 +512,16 @@ def test_sense_says_which_columns_it_converted(tmp_path, capsys):
     assert "column I" not in error
 
 
-def test_the_note_of_a_small_drive_does_not_contradict_the_header(tmp_path, capsys):
+def test_a_small_drive_with_a_unit_in_the_header_has_no_note_on_kilovolts(tmp_path, capsys):
     strain = 0.05 * (1.0 - np.cos(2.0 * np.pi * np.arange(400) / 200.0))
     volt = VoltageMap(1.324, 3.124, -0.2805, -26.92).voltage_v(strain)
     path = tmp_path / "map.csv"
     path.write_text("strain,U (mV)\n" + rows(strain, 1e3 * volt))
     answer = answer_of(capsys, "identify", "voltage-map", path, "--voltage", "U")
-    (note,) = answer["notes"]
-    assert "ahead of the amplifier. If its unit is not V" in note and "kV" not in note
+    assert not any("kV" in note for note in answer["notes"])
+    path.write_text("strain,U\n" + rows(strain, volt))
+    (note,) = answer_of(capsys, "identify", "voltage-map", path, "--voltage", "U")["notes"]
+    assert note.endswith("If it is in kV, add --unit 'U=kV'.")
 
 
 def test_a_capacitance_map_shows_one_slope(tmp_path, capsys):

@@ -80,7 +80,7 @@ def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 COMMANDS = {
-    "identify transfer": ("sweep.csv", "Transfer function Time (s) measured model Residual Input"),
+    "identify transfer": ("sweep.csv", "Transfer function Time (s) measured model Residual u y"),
     "identify arx": ("sweep.csv", "ARX model Residual"),
     "identify subspace": ("sweep.csv --bootstrap 2", "Subspace model"),
     "identify frequency-response": ("sweep.csv", "Magnitude Phase Coherence Frequency (Hz)"),

@@ -18,6 +18,7 @@ from haselab.identify import (
     fit_map,
     fit_voltage_map,
 )
+from haselab.identify.statics.columns import note_on_voltage
 from haselab.models import Gent, LinearMap, VoltageMap
 
 STRETCH = np.linspace(1.0, 3.0, 40)
@@ -134,9 +135,9 @@ def test_strain_in_other_units_is_refused() -> None:
 @pytest.mark.long
 def test_voltage_that_cannot_be_is_refused_and_what_may_be_kilovolts_is_reported() -> None:
     assert "at most 100000 V" in refusal(fit_voltage_map, STRAIN, 1e6 * VOLTS)
-    notes = fit_voltage_map(STRAIN, VOLTS).notes
-    assert any("If its unit is not V, state the unit" in note for note in notes)
-    assert not any("kV" in note for note in fit_voltage_map(STRAIN, 2000.0 * VOLTS).notes)
+    (note,) = note_on_voltage("U", VOLTS)
+    assert f"reaches {VOLTS.max():.3g} only" in note and "--unit 'U=kV'" in note
+    assert not note_on_voltage("U", 2000.0 * VOLTS)
 
 
 @pytest.mark.long

@@ -233,7 +233,7 @@ def test_an_edited_covariance_gives_no_draw(
 
 
 def test_an_infinite_variance_is_no_fault_of_the_covariance() -> None:
-    matrix = ((1.0, 0.0, np.nan), (0.0, 0.0, np.nan), (np.nan, np.nan, np.inf))
+    matrix = ((1.0, 0.5, np.nan), (0.5, 1.0, np.nan), (np.nan, np.nan, np.inf))
     assert PhysicalCovariance(names=("a", "b", "c"), matrix=matrix).matrix[0] == matrix[0]
 
 

@@ -56,6 +56,14 @@ BAD = {
     "no distribution": (GRID + '[design]\nkind = "random"\nsamples = 4\n', r"empty \(0 points\)"),
     "grid with distribution": (DRAWN.replace('"random"', '"grid"'), "is 'grid', but case.gain has"),
     "grid with samples": (GRID + "[design]\nsamples = 4\n", "has no effect with design.kind"),
+    "key without effect": (
+        GEOMETRY + "twin.acquisition.v_noise_v = [1e-4]\n", "v_noise_v has no effect on cases of"),
+    "table without effect": (
+        GEOMETRY.replace("geometry", "controller") + "twin.camera.edge_px = [1.0]\n",
+        "edge_px has no effect on cases of the kind 'controller'"),
+    "delay of the loop": (
+        GEOMETRY.replace("geometry", "controller") + "twin.acquisition.output_delay_s = [1e-3]\n",
+        "output_delay_s has no effect"),
     "no samples": (DRAWN.replace("samples = 4\n", ""), "design.samples is missing; random"),
     "no samples at all": (DRAWN.replace("= 4", "= 0"), "design.samples: .*greater than or equal"),
     "not a power of two": (

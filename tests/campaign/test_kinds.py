@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import json
 import math
+from collections.abc import Iterable
 from typing import Any
 
 import numpy as np
@@ -16,6 +18,7 @@ from haselab.campaign.kinds.case_kind import CASE_KINDS, CaseKind, Inputs
 from haselab.campaign.kinds.geometry import GEOMETRY, GeometrySettings
 from haselab.campaign.work import compute_cases
 from haselab.rig.twin.config import twin_of_reading
+from haselab.scoreboard.plant import fast_bench
 
 HZ = {"twin": twin_of_reading("hz").model_dump(mode="json")}
 
@@ -202,6 +205,47 @@ def test_the_truth_of_a_played_study_is_its_result_without_noise(campaigns: Any)
         assert 0.0 < abs(off) < 5.0 * row.results[f"{name}.std"]
 
 
+def _change_numbers(table: dict[str, Any], keys: Iterable[str]) -> int:
+    """Change the numbers of a table in place; return how many."""
+    count = 0
+    for key in keys:
+        first, _, rest = key.partition(".")
+        value = table[first]
+        if isinstance(value, dict):
+            count += _change_numbers(value, [rest] if rest else value)
+        elif isinstance(value, int | float) and not isinstance(value, bool):
+            lowest = -1.0 if first == "drive_low_v" else 1e-9
+            table[first] = type(value)(0.8 * value) or lowest
+            count += 1
+    return count
+
+
+@pytest.mark.long
+@pytest.mark.parametrize("name", ["geometry", "controller"])
+def test_what_a_kind_ignores_changes_no_result(name: str) -> None:
+    kind = CASE_KINDS.find(name)
+    case = kind.settings().model_dump()
+    changed = json.loads(json.dumps(HZ))
+    assert _change_numbers(changed, kind.ignored) > 10
+    public, found = (
+        dict(kind.compute(Inputs({"case": case, **tables}), np.random.default_rng(1)))
+        for tables in (HZ, changed)
+    )
+    assert found == public
+
+
+def test_a_controller_moves_the_same_with_another_rate_of_the_converter() -> None:
+    twin = twin_of_reading("hz")
+    slow = twin.acquisition.model_copy(update={"rate_hz": 50e3})
+    found = []
+    for config in (twin, twin.model_copy(update={"acquisition": slow})):
+        bench, lengths = fast_bench(config), np.empty(5000)
+        bench.inertia_kg = twin.load.mass_kg
+        bench.move(np.array([1.5]), 1, GRAVITY_M_S2 * twin.load.mass_kg, lengths)
+        found.append(lengths)
+    np.testing.assert_array_equal(*found)
+
+
 def test_a_study_that_the_bench_cannot_play_is_refused_before_it_begins(campaigns: Any) -> None:
     (campaigns.folder / "one.toml").write_text(STUDY)
     with pytest.raises(InputError, match=r"study\.triangle\.high_v = 2\.5"):
@@ -217,3 +261,8 @@ def test_a_kind_of_another_package_is_checked_when_it_is_found() -> None:
     with pytest.raises(InputError, match="its name is 'geometry'"):
         wrong.find("mine")
     assert all(isinstance(kind, CaseKind) for kind in CASE_KINDS.usable().values())
+
+    class Mine(type(GEOMETRY)):
+        name, ignored = "mine", "twin.camera"
+
+    assert fault(Mine(), "mine") == "what it ignores is no tuple of texts"

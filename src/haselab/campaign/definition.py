@@ -179,6 +179,7 @@ def _checked(file: _File, path: Path) -> Campaign:
     axes, distributions = _parameters(file.parameters)
     for key in _paths(axes, distributions):
         _refuse_unknown(key, tables)
+        _refuse_ignored(key, kind)
     found = Campaign(
         file.name, file.kind, file.seed, tables, axes, distributions, file.design, file.time_limit_s
     )  # fmt: skip
@@ -371,6 +372,14 @@ def _refuse_unknown(path: str, tables: Mapping[str, JsonObject]) -> None:
         raise InputError(
             f"parameters.{path} is no key of {' or '.join(tables)}. Begin it with one of "
             f"{', '.join(f'{name}.' for name in tables)}."
+        )
+
+
+def _refuse_ignored(path: str, kind: CaseKind) -> None:
+    if any(path == key or path.startswith(f"{key}.") for key in kind.ignored):
+        raise InputError(
+            f"parameters.{path} has no effect on cases of the kind {kind.name!r}. Remove it, or "
+            "choose another kind."
         )
 
 

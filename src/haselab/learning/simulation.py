@@ -6,6 +6,7 @@ import math
 import warnings
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from operator import attrgetter
 from typing import NoReturn, cast
 
 import numpy as np
@@ -16,12 +17,11 @@ from haselab.actuators import GRAVITY_M_S2
 from haselab.base import InputError, is_real, shown
 from haselab.controllers.network.controller import STRAIN_PER_ONE
 from haselab.learning.tasks import find_task
-from haselab.rig.twin.camera import TwinCameraConfig
 from haselab.rig.twin.config import TwinConfig
-from haselab.rig.twin.twin_bench import native_bench
 from haselab.scoreboard.devices import ZERO_LENGTH_M, Device, drawn, find_device
 from haselab.scoreboard.knowledge import TRAINED
-from haselab.scoreboard.loop_class import CARRIER_HZ, CARRIER_V, CLASSES, STEP_S, noise_of
+from haselab.scoreboard.loop_class import CLASSES, STEP_S, noise_of
+from haselab.scoreboard.plant import WITHOUT_EFFECT, fast_bench
 
 __all__ = ["LARGEST_OBSERVATION", "OBSERVATIONS", "StrainSimulation", "whole_number"]
 
@@ -43,18 +43,6 @@ _USED = 0.85  # of the drive's range: no drawn device breaks down there
 _REACH_UPDATES = 200
 _FAULTS = {1: "breaks down", 2: "leaves the lengths in which its law is valid"}
 _FASTEST_RAD_S = 1e4  # the compiled motion then takes about 2 s for the 140 s in which it settles
-_RATE_HZ = 200e3  # of the converter: the twin moves in steps of 20 samples
-# Keys of a twin without effect: amplifier and monitors have no errors but noise and gain.
-_IGNORED = {
-    "dielectric": ("series_ohm", "leakage_ohm"),
-    "amplifier": (
-        "slew_v_per_s", "current_limit_a", "stray_f",
-        "v_monitor_gain_error", "i_monitor_gain_error", "v_monitor_lag_s", "i_monitor_lag_s",
-        "v_monitor_offset_v", "i_monitor_offset_v",
-    ),
-    "acquisition": ("block_samples", "skew_s", "drive_low_v", "drive_high_v"),
-    "camera": tuple(TwinCameraConfig.model_fields),
-}  # fmt: skip
 
 
 def whole_number(name: str, value: object, low: int, high: int) -> None:
@@ -283,7 +271,7 @@ class StrainSimulation:
 
 def _pool(devices: int | Sequence[Device | TwinConfig], seed: int) -> _Pool:
     listed = [_device(one) for one in _listed(devices, seed)]
-    if ignored := [name for name in _ignorable() if any(_changes(one, name) for one in listed)]:
+    if ignored := [name for name in WITHOUT_EFFECT if any(_changes(one, name) for one in listed)]:
         named = ", ".join(ignored)
         warnings.warn(
             f"The environments ignore {named} of the devices, so these values have no effect.",
@@ -335,15 +323,10 @@ def _device(given: object) -> Device:
     return given
 
 
-def _ignorable() -> list[str]:
-    return [f"{section}.{name}" for section, names in _IGNORED.items() for name in names]
-
-
 def _changes(device: Device, name: str) -> bool:
     """Whether a key of a device differs from that of the public one."""
-    section, key = name.split(".")
-    own, public = (getattr(one.config, section) for one in (device, find_device("hz")))
-    return bool(getattr(own, key) != getattr(public, key))
+    value = attrgetter(name)
+    return bool(value(device.config) != value(find_device("hz").config))
 
 
 def _switch_at(device: Device, number: int) -> int:
@@ -408,9 +391,7 @@ def _noise(device: Device, length_m: float) -> float:
 def _settled(device: Device, number: int) -> _twin.Bench:
     """A bench whose device was stretched once, and now hangs at the drive of strain 0."""
     _check_speed(device, number)
-    clock = device.config.acquisition.model_copy(update={"rate_hz": _RATE_HZ})
-    bench = native_bench(device.config.model_copy(update={"acquisition": clock}), 0)
-    bench.carrier_v, bench.carrier_rad_s = CARRIER_V, 2.0 * math.pi * CARRIER_HZ
+    bench = fast_bench(device.config)
     own_kg = device.config.load.added_inertia_kg + device.law.moving_mass_kg
     plan = ((TRAINED, 0.0, _TRAIN_S), (1.0, 0.0, _REST_S), (1.0, device.zero_v, _REST_S))
     for share, drive_v, duration_s in plan:

@@ -7,16 +7,39 @@ import math
 import numpy as np
 from numpy.typing import NDArray
 
+from haselab import _twin
 from haselab.actuators import GRAVITY_M_S2
+from haselab.rig.twin.config import TwinConfig
 from haselab.rig.twin.twin_bench import native_bench
 from haselab.scoreboard.devices import Device
 from haselab.scoreboard.knowledge import TRAINED
 from haselab.scoreboard.loop_class import CARRIER_HZ, CARRIER_V, STEP_S, LoopClass, noise_of
 
-__all__ = ["FastPlant", "relative_noise_of"]
+__all__ = ["WITHOUT_EFFECT", "FastPlant", "fast_bench", "relative_noise_of"]
 
 Floats = NDArray[np.float64]
 _TRAIN_S, _REST_S = 20.0, 60.0
+_RATE_HZ = 200e3  # of the converter: the twin moves in steps of 20 samples
+#: Keys of a twin without effect: amplifier and monitors have no errors but noise and gain.
+WITHOUT_EFFECT = (
+    "dielectric.series_ohm", "dielectric.leakage_ohm", "amplifier.slew_v_per_s",
+    "amplifier.current_limit_a", "amplifier.stray_f", "amplifier.v_monitor_gain_error",
+    "amplifier.i_monitor_gain_error", "amplifier.v_monitor_lag_s", "amplifier.i_monitor_lag_s",
+    "amplifier.v_monitor_offset_v", "amplifier.i_monitor_offset_v", "acquisition.block_samples",
+    "acquisition.skew_s", "acquisition.drive_low_v", "acquisition.drive_high_v", "camera",
+)  # fmt: skip
+
+
+def fast_bench(config: TwinConfig) -> _twin.Bench:
+    """The mechanics of a twin in C with the carrier on, in steps of 0.1 ms.
+
+    Args:
+        config: of the twin. The rate of its converter has no effect on the steps.
+    """
+    clock = config.acquisition.model_copy(update={"rate_hz": _RATE_HZ})
+    bench = native_bench(config.model_copy(update={"acquisition": clock}), 0)
+    bench.carrier_v, bench.carrier_rad_s = CARRIER_V, 2.0 * math.pi * CARRIER_HZ
+    return bench
 
 
 def relative_noise_of(loop: LoopClass, device: Device) -> float:
@@ -47,8 +70,7 @@ class FastPlant:
         self, device: Device, loop: LoopClass, rng: np.random.Generator, updates: int
     ) -> None:
         self._device, self._loop, self._rng = device, loop, rng
-        self._bench = native_bench(device.config, 0)
-        self._bench.carrier_v, self._bench.carrier_rad_s = CARRIER_V, 2.0 * math.pi * CARRIER_HZ
+        self._bench = fast_bench(device.config)
         self._lead = max(1 - loop.first, 1)  # lengths before the first update
         self.lengths_m = np.zeros(self._lead + updates * loop.steps)
         waiting, switch_at = divmod(loop.switch_at + round(device.late_s / STEP_S), loop.steps)

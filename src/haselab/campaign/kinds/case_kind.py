@@ -65,6 +65,8 @@ class CaseKind(abc.ABC):
     name: ClassVar[str]
     files: ClassVar[tuple[BaseFile, ...]] = ()
     settings: ClassVar[type[Section]]
+    #: Keys and tables without effect on the results, such as `twin.camera`; none can be varied.
+    ignored: ClassVar[tuple[str, ...]] = ()
 
     @abc.abstractmethod
     def check(self, inputs: Inputs) -> None:
@@ -100,7 +102,10 @@ def _fault(kind: Any, name: str) -> str:
         return f"its name is {kind.name!r}"
     if not (isinstance(kind.settings, type) and issubclass(kind.settings, Section)):
         return "its settings are no class derived from Section"
-    return "" if all(isinstance(each, BaseFile) for each in kind.files) else "a file is no BaseFile"
+    if not all(isinstance(each, BaseFile) for each in kind.files):
+        return "a file is no BaseFile"
+    texts = isinstance(kind.ignored, tuple) and all(isinstance(key, str) for key in kind.ignored)
+    return "" if texts else "what it ignores is no tuple of texts"
 
 
 CASE_KINDS: Registry[CaseKind] = Registry(

@@ -22,6 +22,7 @@ from haselab.scoreboard.devices import find_device
 from haselab.scoreboard.entrants import Designed, designed, entering_kinds
 from haselab.scoreboard.knowledge import identified, known_by
 from haselab.scoreboard.loop_class import CLASSES
+from haselab.scoreboard.plant import WITHOUT_EFFECT
 from haselab.scoreboard.play import play
 from haselab.scoreboard.tasks import TASKS
 from haselab.store.toml import Section
@@ -43,6 +44,8 @@ class _Controller(CaseKind):
     name = "controller"
     files = (TWIN,)
     settings = ControllerSettings
+    # the class of the loop has its own timing and limits
+    ignored = tuple(f"twin.{key}" for key in (*WITHOUT_EFFECT, "acquisition.output_delay_s"))
 
     def check(self, inputs: Inputs) -> None:
         case, twin = inputs.settings(ControllerSettings), twin_of(inputs)

@@ -37,6 +37,10 @@ class _Geometry(CaseKind):
     name = "geometry"
     files = (TWIN,)
     settings = GeometrySettings
+    ignored = (
+        "twin.amplifier", "twin.acquisition", "twin.camera", "twin.unmodelled",
+        "twin.dielectric.series_ohm", "twin.dielectric.leakage_ohm",
+    )  # fmt: skip
 
     def check(self, inputs: Inputs) -> None:
         inputs.settings(GeometrySettings)

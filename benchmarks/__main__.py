@@ -50,7 +50,7 @@ SECTIONS: dict[str, tuple[Measurement, ...]] = {
         Measurement("control.margins", quick={"loops": 200}),
     ),
     "scoreboard": (Measurement("control.scoreboard", full={"whole": True, "seeds": 5}),),
-    "campaign": (Measurement("campaign.campaign"),),
+    "campaign": (Measurement("campaign.campaign", quick={"cases": 1000}),),
     "learning": (Measurement("control.learning"),),
     "recording": (
         Measurement("rig.recording", quick={"seconds": 20.0, "live": 10.0, "kills": 3}),

@@ -38,6 +38,7 @@ from haselab.store.campaign.shards import CaseRow, Shards
 
 CASES = 10_000
 FINISHED = 100_000
+_GOAL = 0.9  # of T1 / (N TN), for all CASES
 CAMPAIGN = """
 name = "quick virtual devices"
 kind = "transfer"
@@ -164,6 +165,7 @@ def rows(cases: int = CASES, finished: int = FINISHED, repeats: int = 1) -> Iter
     """
     with tempfile.TemporaryDirectory() as name:
         plan = _plan(Path(name), cases)
+        goal = _GOAL if cases >= CASES else None  # with fewer, the start of the workers counts more
         rounds = []
         for number in range(repeats):
             folder = Path(name) / f"round-{number}"
@@ -176,15 +178,15 @@ def rows(cases: int = CASES, finished: int = FINISHED, repeats: int = 1) -> Iter
         about = f"{cases:,} devices, {1e3 * one.wall_s / cases:.2g} ms each"
         load = f"load average {os.getloadavg()[0]:.1f} on {os.cpu_count()} cores"
         share = one.wall_s / (2.0 * running.wall_s)
-        yield Row("T1 / (2 T2), 2 workers of a running Dask scheduler", share, "", 0.9)
+        yield Row("T1 / (2 T2), 2 workers of a running Dask scheduler", share, "", goal)
         for what, found in (("2 processes", two), ("2 Dask workers", dask)):
             share = one.wall_s / (2.0 * found.wall_s)
-            yield Row(f"T1 / (2 T2), {what}", share, "", 0.9, note=f"{about}, {load}")
+            yield Row(f"T1 / (2 T2), {what}", share, "", goal, note=f"{about}, {load}")
             own_s = 1e3 * found.own_s / cases
             yield Row(f" of this program, {what}", own_s, "ms/case")
         # The time of all processes together does not depend on other programs on the computer.
         share = one.workers_s / (two.own_s + two.workers_s)
-        yield Row("T1 / (2 T2) by processor time, 2 processes", share, "", 0.9)
+        yield Row("T1 / (2 T2) by processor time, 2 processes", share, "", goal)
         finished_by = {name: finished_rows(plan, folder / name) for name in ("two", "dask")}
         same = [(row.case, row.results) for row in finished_by["two"]] == [
             (row.case, row.results) for row in finished_by["dask"]

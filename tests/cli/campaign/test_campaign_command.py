@@ -173,15 +173,15 @@ kind = "geometry"
 twin = "hz"
 [parameters]
 twin.load.mass_kg = [0.2, {}]
-twin.camera.exposure_s = [1e-3, 1.2e-3, 1.4e-3, 1.6e-3]
+twin.hysteresis.width = [1e-3, 1.2e-3, 1.4e-3, 1.6e-3]
 """
     for name, mass_kg, more in (("one", 0.25, ()), ("two", 0.3, ("--compare", "one"))):
         file.write_text(grid.format(mass_kg))
         assert code_of("campaign", file, "--out", name, "--workers", 1, *more) == 0
         said = capsys.readouterr().err
-        assert said.count("no result depends on") == 1 and "twin.camera.exposure_s" in said
+        assert said.count("no result depends on") == 1 and "twin.hysteresis.width" in said
     summary = json.loads(Path("two/summary.json").read_text())
-    assert summary["without_effect"] == ["twin.camera.exposure_s"]
+    assert summary["without_effect"] == ["twin.hysteresis.width"]
     assert summary["comparison"]
     for one in summary["comparison"]:
         assert all(one[key]["ci95"] is None for key in ("here", "there", "difference"))

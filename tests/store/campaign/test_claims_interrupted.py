@@ -1,7 +1,11 @@
-"""Ctrl-C between any two steps of a claim."""
+"""Claims of programs that are interrupted or killed between any two steps."""
 
 from __future__ import annotations
 
+import contextlib
+import errno
+import os
+import threading
 from pathlib import Path
 from typing import Any
 
@@ -14,7 +18,11 @@ def claims_of(folder: Path) -> list[str]:
     return sorted(path.name for path in (folder / "claims").iterdir())
 
 
-@pytest.mark.parametrize("step", ["open", "unlink"])
+def without_links(path: Path, target: Path) -> None:
+    raise PermissionError(errno.EPERM, os.strerror(errno.EPERM))
+
+
+@pytest.mark.parametrize("step", ["hardlink_to", "open", "unlink"])
 @pytest.mark.parametrize("after", [False, True])
 def test_an_interrupt_leaves_no_claim(
     step: str, after: bool, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
@@ -34,8 +42,44 @@ def test_an_interrupt_leaves_no_claim(
     with pytest.raises(KeyboardInterrupt, match=r"^$"), Claims(tmp_path) as claims:
         if step == "unlink":
             assert claims.take(7)
+        if step == "open":
+            monkeypatch.setattr(Path, "hardlink_to", without_links)
         monkeypatch.setattr(Path, step, interrupted)
-        claims.take(7) if step == "open" else claims.release(7)
+        claims.release(7) if step == "unlink" else claims.take(7)
+    assert claims_of(tmp_path) == []
+
+
+def test_a_claim_never_exists_without_the_name_of_its_program(tmp_path: Path) -> None:
+    """A program that is killed while it claims a block must not leave one that seems to be new."""
+    names: set[str] = set()
+    ended = threading.Event()
+
+    def look() -> None:
+        while not ended.is_set():
+            for claim in (tmp_path / "claims").iterdir():
+                with contextlib.suppress(FileNotFoundError):
+                    names.add(claim.read_text())
+
+    with Claims(tmp_path) as claims:
+        watch = threading.Thread(target=look)
+        watch.start()
+        try:
+            for block in range(3000):
+                assert claims.take(block % 50)
+                claims.release(block % 50)
+        finally:
+            ended.set()
+            watch.join()
+    assert names == {claims.writer}
+
+
+def test_a_file_system_without_links_has_claims(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(Path, "hardlink_to", without_links)
+    with Claims(tmp_path) as first, Claims(tmp_path) as second:
+        assert first.take(7) and not second.take(7)
+        assert (tmp_path / "claims" / "7").read_text() == first.writer
     assert claims_of(tmp_path) == []
 
 

@@ -47,6 +47,8 @@ class Claims:
             self._claims.mkdir(parents=True, exist_ok=True)
             self._programs.mkdir(exist_ok=True)
             self._file = self._own.open("x+b")
+            self._file.write(self.writer.encode())
+            self._file.flush()
         except OSError as error:
             raise DeviceError(
                 f"Cannot write ({error.strerror}). Free disk space, or change the permissions. "
@@ -102,8 +104,7 @@ class Claims:
         self._held.add(block)  # first: an interrupt must not leave a claim that nobody releases
         for _ in range(2):
             try:
-                with path.open("x", encoding="utf-8") as file:
-                    file.write(self.writer)
+                self._make(path)
             except FileExistsError:
                 if self._is_alive(path):
                     break
@@ -119,6 +120,24 @@ class Claims:
         self._held.discard(block)
         return False
 
+    def _make(self, claim: Path) -> None:
+        """Make a claim with the name of this program.
+
+        It is a link to the file of this program, so that it never exists without the name: a
+        program that is killed here leaves no claim of which nobody knows whose it is.
+
+        Raises:
+            FileExistsError: there is such a claim.
+            OSError: the disk is full, or refuses.
+        """
+        try:
+            claim.hardlink_to(self._own)
+        except FileExistsError:
+            raise
+        except (OSError, NotImplementedError):  # a file system without links
+            with claim.open("x", encoding="utf-8") as file:
+                file.write(self.writer)
+
     def release(self, block: int) -> None:
         """End a claim.
 
@@ -133,7 +152,7 @@ class Claims:
         """Whether the program of a claim still works on it."""
         try:
             name = claim.read_text(encoding="utf-8")
-            if not name:  # just created, or its program ended in between
+            if not name:  # just created without a link, or its program ended in between
                 return _is_recent(claim)
             return self._is_program_alive(self._programs / name)
         except OSError:  # the claim has gone

@@ -14,6 +14,7 @@ from haselab.base import InputError, JsonObject, is_real, shown
 from haselab.panel.files import PanelFiles
 from haselab.store.folder import write_text
 from haselab.store.manifest import read_manifest, recorded_when
+from haselab.store.text_file import read_text
 
 __all__ = ["analyse", "analyse_recorded", "compare", "listed", "note", "report"]
 
@@ -104,8 +105,8 @@ def _ended(text: str) -> str:
 
 def _read(path: Path) -> str:
     try:
-        return path.read_text(encoding="utf-8")[:_MOST_LETTERS]
-    except (OSError, ValueError):
+        return read_text(path)[:_MOST_LETTERS]
+    except InputError:
         return ""
 
 
@@ -142,8 +143,8 @@ def report(files: PanelFiles, values: JsonObject) -> JsonObject:
     """
     folder = _recording(files, values.get("name"))
     try:
-        return {"html": (folder / "report.html").read_text(encoding="utf-8")}
-    except (OSError, ValueError):
+        return {"html": read_text(folder / "report.html")}
+    except InputError:
         why = " ".join(_read(folder / _LOG).split())
         raise InputError(
             f"There is no report of {folder.name} yet."
@@ -218,12 +219,12 @@ def compare(files: PanelFiles, values: JsonObject) -> JsonObject:
 def _results(files: PanelFiles, name: object) -> dict[str, Any]:
     folder = _recording(files, name)
     try:
-        content = json.loads((folder / "results.json").read_text(encoding="utf-8"))
+        content = json.loads(read_text(folder / "results.json"))
         found = {str(row["id"]): row for row in content["quantities"] if row["measured"]}
         if not all(_is_result(row) for row in found.values()):
             raise ValueError
         return found
-    except (OSError, ValueError, KeyError, TypeError):
+    except (ValueError, KeyError, TypeError):
         raise InputError(
             f"{folder.name} has no results that can be read. Press Analyse first."
         ) from None

@@ -155,3 +155,17 @@ def main_ok(*words: str) -> None:
     with pytest.raises(SystemExit) as stop:
         main(list(words))
     assert stop.value.code == 0
+
+
+@pytest.mark.parametrize(
+    ("kind", "sign", "noted"),
+    [("planar-hasel", -1.0, True), ("planar-hasel", 1.0, False), ("peano-hasel", -1.0, False)],
+)
+def test_a_planar_hasel_that_seems_to_become_shorter_is_noted(
+    capacitance: Path, capsys: pytest.CaptureFixture[str], kind: str, sign: float, noted: bool
+) -> None:
+    Path("A.toml").write_text(ACTUATOR.replace("planar-hasel", kind))
+    strain_file("t;x", 1.0, sign * STRAIN)
+    code, out, _ = fitted(capsys, "--strain", "x", "--actuator", "A.toml")
+    assert code == 0 and slope(out) == pytest.approx(sign * SLOPE_PER_F, rel=0.01)
+    assert ("The strain falls as the capacitance rises" in out) == noted

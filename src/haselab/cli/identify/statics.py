@@ -30,7 +30,7 @@ from haselab.cli.identify.common import (
 )
 from haselab.cli.options import shared_option
 from haselab.cli.plot import save_plot
-from haselab.identify.statics.capacitance_map import fit_capacitance_map
+from haselab.identify.statics.capacitance_map import CapacitanceMapFit, fit_capacitance_map
 from haselab.identify.statics.columns import note_on_voltage
 from haselab.identify.statics.hyperelastic import (
     HyperelasticFit,
@@ -40,6 +40,7 @@ from haselab.identify.statics.hyperelastic import (
 from haselab.identify.statics.regions import find_regions
 from haselab.identify.statics.voltage_map import fit_voltage_map
 from haselab.models import DEFORMATIONS, LAWS, Deformation
+from haselab.models.actuator import ActuatorTables
 from haselab.store.columns.selection import ColumnOptions
 from haselab.store.columns.table import read_table
 
@@ -317,6 +318,7 @@ def capacitance_map(
     if pairs.in_farads and "slope" in fit.parameters:
         slope = replace(fit.parameters["slope"], unit="1/F")
         fit = replace(fit, parameters={**fit.parameters, "slope": slope})
+    fit = replace(fit, notes=(*fit.notes, *_slope_notes(fit, known)))
     more: dict[str, object] = {}
     if actuator is not None and fit.succeeded:
         section = save_strain_map(actuator, pairs, files)
@@ -324,3 +326,16 @@ def capacitance_map(
         more = {"strain_map": found if as_json or out is not None else _FOR_LOOPS}
     emit_fit(fit, files, as_json, out, more)
     save_plot(plot, fit.chart)
+
+
+def _slope_notes(fit: CapacitanceMapFit, known: ActuatorTables | None) -> tuple[str, ...]:
+    """A note if the strain falls with the capacitance of a device that grows with it."""
+    if known is None or known.actuator.kind != "planar-hasel" or not fit.succeeded:
+        return ()
+    if fit.parameters["slope"].ci95[1] >= 0.0:
+        return ()
+    return (
+        "The strain falls as the capacitance rises, but a planar-hasel becomes longer as its "
+        "capacitance rises. Check the sign of the strain and the columns. If the actuator is of "
+        "another kind, state it: [actuator] kind.",
+    )

@@ -217,8 +217,7 @@ def read_recorded(
         held_at_hz: update rate of the output converter; None: the sampling rate.
         columns: what the user states about the columns.
         hold: how the input behaves between its updates; None: not stated, so held is assumed.
-        through: actuator file whose voltage map converts the input from V to strain. The input is
-            then a commanded voltage, which is held.
+        through: actuator file whose voltage map converts the input from V to strain.
         to_strain: with `through`, also convert an output in m to strain if the file has the length
             at strain 0.
     Returns:
@@ -245,7 +244,7 @@ def read_recorded(
             changed[output] = strains_of(output, table[output], stated, file, known)
             units = "1", "1"
         table = replace(table, columns={**table.columns, **changed})
-    assumed = hold is None and held_at_hz is None and through is None
+    assumed = hold is None and held_at_hz is None
     hold = "zero" if hold is None else hold
     time_s = table.time_s if table.rate_hz is None else None
     if time_s is not None and held_at_hz is None:

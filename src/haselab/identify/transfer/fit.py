@@ -15,7 +15,6 @@ from haselab.base import Estimate, InputError, JsonObject, ResultError, checked
 from haselab.base.chart import Chart
 from haselab.identify.charts import records_chart
 from haselab.identify.fit import Prediction, RecordFit, several
-from haselab.identify.frequency.steady_tone import steady_tone_hz
 from haselab.identify.noise import coloured_covariance, fit_percent
 from haselab.identify.prediction import fitted_output, predict
 from haselab.identify.record import Record, finite_vector, record_notes
@@ -23,8 +22,15 @@ from haselab.identify.residual_tests import input_correlation_p
 from haselab.identify.transfer.bode import bode_panels
 from haselab.identify.transfer.checks.ambiguity import OtherMinimum, ambiguity, find_other_minima
 from haselab.identify.transfer.checks.diagnosis import diagnose
+from haselab.identify.transfer.checks.preconditions import (
+    check_size,
+    count_outputs,
+    runs_away,
+    too_few_tones,
+)
 from haselab.identify.transfer.feedback import feedback_p
 from haselab.identify.transfer.layout import Layout, TransferStructure, layout_of
+from haselab.identify.transfer.oversampled import at_lower_rate
 from haselab.identify.transfer.parameters import (
     covariance_table,
     follows_input,
@@ -44,8 +50,7 @@ __all__ = ["Record", "TransferFit", "TransferStructure", "fit_transfer", "with_r
 
 Floats = NDArray[np.float64]
 _HELD_OUT = 0.25
-_MOST_RECORDS = 64
-_RUNAWAY = 1.3  # growth per eighth of a record
+_FILTERED = 1e-3  # of the output: noise that is far above the errors of a filtered record
 _SWAPPED = 50.0  # per cent of fit with the columns swapped
 _LITTLE = 30.0  # per cent of fit
 _RELATED = 1e-3
@@ -55,9 +60,10 @@ _UNEXPLAINED = (
 )
 _NOT_WHITE = (
     "The residuals are not white: the model does not explain everything, and the intervals are "
-    "valid only if its structure is right. Try --slow-modes 1 (creep), --choose nonlinear (such as "
-    "the square of a voltage), or --choose all."
+    "valid only if its structure is right. Try {}--choose nonlinear (such as the square of a "
+    "voltage), or --choose all."
 )
+_CREEP = "--slow-modes 1 (creep), "
 _FEEDBACK = 1e-6  # probability below which the input follows the residuals
 _NO_DISTURBANCE = 99.0  # per cent of fit above which no disturbance matters
 _FED_BACK = (
@@ -343,7 +349,7 @@ def _fitted(
     near: TransferFit | None,
 ) -> TransferFit:
     """Fit the records; if the result is in doubt, test other explanations of them."""
-    tones = _too_few_tones(layout_of(structure), records)
+    tones = too_few_tones(layout_of(structure), at_lower_rate(records, structure.poles) or records)
     if tones is not None:
         return _no_result(layout_of(structure), tones)
     fit = _fit(layout_of(structure), records, applied=applied, near=near)
@@ -362,43 +368,23 @@ def _fitted(
     return replace(fit, notes=(*fit.notes, _RESTING))
 
 
-def _too_few_tones(layout: Layout, records: Sequence[Record]) -> str | None:
-    """Why steady tones cannot determine the parameters; None when the records suffice."""
-    if not layout.structure.initial_state:
-        return None
-    tones: set[float] = set()
-    for record in records:
-        tone = steady_tone_hz(record)
-        if tone is None:
-            return None
-        if not any(abs(tone - other) * record.duration_s < 1.0 for other in tones):
-            tones.add(tone)
-    numbers = layout.free.size + int(np.isnan(layout.factor_template).sum())
-    if not tones or numbers <= 2 * len(tones):
-        return None
-    shown = " and ".join(f"{tone:.4g} Hz" for tone in sorted(tones))
-    return (
-        f"input and output are steady tones of {shown}, which determine {2 * len(tones)} "
-        f"parameters, not {numbers}; excite more frequencies, or include the start from rest"
-    )
-
-
 def _fit(
     layout: Layout, records: Sequence[Record], *, applied: bool, near: TransferFit | None = None
 ) -> TransferFit:
     """Search the parameters, from a near fit if there is one, then describe the result."""
-    _check_size(layout, records)
+    check_size(layout, records)
     known = [] if near is None or near.best is None else [near.best.found.search]
-    tried: list[Best] = []
-    for variant in _variants(records):
-        found_before = [one.search for best in tried for one in (best.found, *best.others[:2])]
-        starts = [*known, *found_before]
-        search = best_fit(layout, variant, starts, 0.0 if known else LEAST_GAIN)
-        tried += [] if search is None else [search]
-    if not tried:
+    slower = None if known else at_lower_rate(records, layout.structure.poles)
+    best = _search(layout, records if slower is None else slower, known)
+    if best is None:
         return _no_result(layout, "no stable model found; record longer, or fit fewer poles")
-    best = min(tried, key=lambda entry: entry.found.cost)
-    whole = near is not None and near.succeeded and _outputs(near.records) == _outputs(records)
+    if slower is not None:
+        return _describe_all(layout, records, best, applied=applied)
+    whole = (
+        near is not None
+        and near.succeeded
+        and count_outputs(near.records) == count_outputs(records)
+    )
     if applied and whole:  # the fit nearby had no output to exclude
         return _describe(layout, best)
     found = diagnose(layout, best, applied=applied)
@@ -408,9 +394,41 @@ def _fit(
     return replace(fit, notes=(*fit.notes, *found.notes))
 
 
-def _outputs(records: Sequence[Record]) -> int:
-    """Number of outputs in all records."""
-    return sum(record.y.size for record in records)
+def _search(layout: Layout, records: Sequence[Record], known: Sequence[Floats]) -> Best | None:
+    """The best solution over the guesses of inputs before the records."""
+    tried: list[Best] = []
+    for variant in _variants(records):
+        found_before = [one.search for best in tried for one in (best.found, *best.others[:2])]
+        starts = [*known, *found_before]
+        search = best_fit(layout, variant, starts, 0.0 if known else LEAST_GAIN)
+        tried += [] if search is None else [search]
+    return min(tried, key=lambda entry: entry.found.cost, default=None)
+
+
+def _describe_all(
+    layout: Layout, records: Sequence[Record], best: Best, *, applied: bool
+) -> TransferFit:
+    """Describe a fit to all outputs, which starts at the solution for a lower rate.
+
+    Spikes, clipping and wrong times are searched for at the lower rate; only if something is found,
+    in all outputs, too.
+    """
+    found = diagnose(layout, best, applied=applied)
+    starts = [one.search for one in (best.found, *best.others)]
+    whole = _search(layout, records, starts)
+    if whole is None:
+        return _no_result(layout, "no stable model found; record longer, or fit fewer poles")
+    if found.fault is not None or found.notes:
+        found = diagnose(layout, whole, applied=applied)
+        whole = found.best
+    noise = math.sqrt(best.found.cost / count_outputs(best.records))
+    if noise > _FILTERED * max(float(np.std(record.y)) for record in best.records):
+        # At the lower rate, the test sees slow residuals that are small beside the noise.
+        whole = replace(whole, whiteness_p=min(whole.whiteness_p, best.whiteness_p))
+    fit = _describe(layout, whole)
+    if found.fault is not None:
+        fit = replace(fit, status=found.fault, ambiguous=False)
+    return replace(fit, notes=(*fit.notes, *found.notes))
 
 
 def _is_fed_back(fit: TransferFit) -> bool:
@@ -429,7 +447,7 @@ def _doubtful(fit: TransferFit) -> bool:
 
 def _why(structure: TransferStructure, records: Sequence[Record]) -> str | None:
     """Cause of a fit without a result, if it can be detected."""
-    if any(_runs_away(record) for record in records):
+    if any(runs_away(record) for record in records):
         return (
             "no result: the output grows to the end of the record, so the plant is not stable "
             "there; cut the record, or close a loop around it"
@@ -440,29 +458,6 @@ def _why(structure: TransferStructure, records: Sequence[Record]) -> str | None:
         if backwards.succeeded and backwards.fit_percent > _SWAPPED:
             return "no result: the input responds to the output; the columns are swapped"
     return None
-
-
-def _runs_away(record: Record) -> bool:
-    """Whether the output grows by a third or more in each of the last eighths of the record."""
-    parts = np.array_split(record.y - np.median(record.y[: max(1, record.y.size // 8)]), 8)
-    size = np.sqrt([float(part @ part) / part.size for part in parts])
-    return bool((size[4:] > _RUNAWAY * size[3:-1]).all())
-
-
-def _check_size(layout: Layout, records: Sequence[Record]) -> None:
-    if len(records) > _MOST_RECORDS:
-        raise InputError(
-            f"There are {len(records)} records; at most {_MOST_RECORDS} are possible. "
-            "Fit groups of records and compare the results, or leave some out."
-        )
-    count = _outputs(records)
-    own = layout.structure.offset + sum(s.order for s in layout.sections)
-    wanted = layout.free.size + len(layout.factor_names) + own * len(records)
-    if count < 2 * wanted:
-        raise InputError(
-            f"The records have {count} outputs; {wanted} parameters need at least {2 * wanted}. "
-            "Record longer, or fit fewer poles."
-        )
 
 
 def _variants(records: Sequence[Record]) -> list[list[Record]]:
@@ -560,5 +555,5 @@ def _notes(structure: TransferStructure, best: Best, estimates: dict[str, Estima
     if structure.zeros == structure.poles and structure.delay == "auto":
         notes.append("With as many zeros as poles the delay is assumed to be 0 s.")
     if best.whiteness_p < 0.05:
-        notes.append(_NOT_WHITE)
+        notes.append(_NOT_WHITE.format("" if structure.slow_modes else _CREEP))
     return notes

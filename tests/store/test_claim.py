@@ -15,6 +15,7 @@ from haselab.store.claim import (
     claimed_file,
     claimed_folder,
     create_exclusively,
+    is_left_empty,
     is_occupied,
     move_aside,
 )
@@ -220,3 +221,40 @@ def test_a_file_system_that_permits_no_files_is_bad_input():
         claimed_file(Path("/proc/x")),
     ):
         raise AssertionError("must not be entered")
+
+
+_KILLED = """
+import sys, time
+from pathlib import Path
+from haselab.store.claim import claimed_file
+with claimed_file(Path(sys.argv[1])):
+    print("claimed", flush=True)
+    time.sleep(600)
+"""
+
+
+@pytest.mark.skipif(sys.platform != "linux", reason="the lock cannot be seen here")
+def test_an_empty_file_of_a_killed_program_does_not_block_the_next_one(tmp_path):
+    path = tmp_path / "figure.svg"
+    with subprocess.Popen(
+        [sys.executable, "-c", _KILLED, str(path)], stdout=subprocess.PIPE, text=True
+    ) as other:
+        assert other.stdout is not None and other.stdout.readline() == "claimed\n"
+        os.utime(path, (0.0, 0.0))
+        assert is_occupied(path)  # it has the lock
+        with pytest.raises(InputError), claimed_file(path):
+            pass
+        other.kill()
+    assert is_left_empty(path) and not is_occupied(path)
+    path.chmod(0o600)
+    with claimed_file(path):
+        assert not is_left_empty(path)
+        path.write_text("result")
+    assert path.read_text() == "result" and path.stat().st_mode & 0o777 == 0o600
+    os.utime(path, (0.0, 0.0))
+    assert is_occupied(path)
+
+
+def test_a_new_empty_file_is_not_taken(tmp_path):
+    (tmp_path / "new").touch()
+    assert is_occupied(tmp_path / "new")

@@ -6,17 +6,20 @@ import contextlib
 import errno
 import os
 import secrets
+import stat
 import sys
+import time
 from collections.abc import Iterator
 from pathlib import Path
 
 from haselab.base import DeviceError, HaselabError, InputError
-from haselab.store.session.lock import hold, is_held
+from haselab.store.session.lock import CAN_TELL, hold, is_held
 
 __all__ = [
     "claimed_file",
     "claimed_folder",
     "create_exclusively",
+    "is_left_empty",
     "is_occupied",
     "joined_folder",
     "move_aside",
@@ -25,6 +28,7 @@ __all__ = [
 ]
 
 _MOST_PREVIOUS = 10_000
+_AGE_S = 1.0  # of an empty file, after which the program that created it has locked it
 _LOG = "guardian.log"  # only appended to, by any program
 _BAD_PATH = (errno.EEXIST, errno.ENOTDIR, errno.EISDIR, errno.ELOOP, errno.ENAMETOOLONG)
 _NOT_PERMITTED = (errno.ENOENT, errno.EACCES, errno.EPERM, errno.EROFS)
@@ -72,21 +76,27 @@ def claimed_file(path: Path) -> Iterator[None]:
     created for it.
 
     Args:
-        path: of a file that does not exist; a pipe or a device is not touched.
+        path: of a file that does not exist, or that a program left empty which was killed; a pipe
+            or a device is not touched.
     Raises:
         InputError: the path exists, another program has just created it, or no file can be created
             there.
         DeviceError: the disk refuses.
     """
-    if path.exists() and not is_occupied(path):
+    is_old = is_left_empty(path)
+    if path.exists() and not (is_old or is_occupied(path)):
         yield
         return
     made = _make_parents(path.parent)
     try:
-        create_exclusively(path)
+        if not is_old:
+            create_exclusively(path)
         with path.open("r+b") as file:
-            with contextlib.suppress(OSError):  # a file system without such locks
+            try:
                 hold(file.fileno())
+            except OSError:  # a file system without such locks, or another program was faster
+                if is_old:
+                    raise _in_use(path) from None
             mine = os.fstat(file.fileno())
             if not _is_file(path, mine):  # moved aside between the two lines above
                 raise _in_use(path)
@@ -171,14 +181,30 @@ def _create_whole(path: Path, content: bytes) -> None:
         draft.unlink(missing_ok=True)
 
 
+def is_left_empty(path: Path) -> bool:
+    """Whether a path is an empty file that no program is about to write.
+
+    Such a file is left if a program is killed before it has written its result. It is younger than
+    its lock for a moment, so only one of some age counts.
+    """
+    try:
+        status = path.lstat()
+    except OSError:
+        return False
+    is_empty = stat.S_ISREG(status.st_mode) and status.st_size == 0
+    return CAN_TELL and is_empty and time.time() - status.st_mtime > _AGE_S and not is_held(path)
+
+
 def is_occupied(path: Path) -> bool:
     """Whether the path must not be overwritten: a file, a broken link, or a non-empty folder.
+
+    An empty file that a killed program has left may be.
 
     Pipes and devices, and links to them, may be written to.
     """
     if path.is_dir():
         return any(path.iterdir())
-    return path.is_file() or (path.is_symlink() and not path.exists())
+    return (path.is_file() and not is_left_empty(path)) or (path.is_symlink() and not path.exists())
 
 
 def move_aside(path: Path, *, is_claimed: bool = False) -> Path:

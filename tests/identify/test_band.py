@@ -46,6 +46,12 @@ def test_a_small_excess_is_a_note_with_its_cause(added, words):
     assert found.note.startswith("Only ")
 
 
+def test_an_excess_of_few_independent_errors_is_not_silent():
+    found = judged(2.1 * STD * np.sin(0.25 * TIME_S) + 0.1 * noise())
+    assert found.error == "" and 0.6 < found.inside < 0.85
+    assert "of them are independent, so this may be chance" in found.note
+
+
 def test_a_large_excess_is_a_model_error_but_larger_white_noise_is_not():
     swing = 4.0 * STD * np.sin(28.0 * TIME_S)
     assert judged(noise() + swing).error.startswith("model error: the rms error is ")

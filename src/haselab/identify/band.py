@@ -16,6 +16,7 @@ __all__ = ["BandCheck"]
 
 Floats = NDArray[np.float64]
 _INSIDE, _BY_CHANCE = 0.95, 1e-4  # share of the samples inside; probability of fewer by chance
+_NEARLY = 0.85  # share inside that is noticed even if chance explains it
 _LARGE = 2.0  # standard deviations of the band, from which the rms error is a model error
 _FAR = 3.5  # standard deviations of an error of the parameters that all samples share
 _NOISIER = 1.1  # noise over that of the fit, which is noticed
@@ -90,15 +91,22 @@ class BandCheck:
 
     @property
     def note(self) -> str:
-        """Sentences if fewer samples are inside the band than chance explains; else empty."""
+        """Sentences if clearly fewer samples than stated are inside the band; else empty."""
         from scipy.stats import binom  # slow to import
 
         # The correlation of the errors themselves would be that of the noise, which hides an error
         # that all samples share.
         inside = [(np.abs(e) <= Z95).astype(np.float64) for e in self.errors]
         independent = round(effective_count([part - self.inside for part in inside]))
+        percent = f"{100.0 * self.inside:.4g}"
+        few = f"Only {percent} % of the samples are inside the band of 95 %."
         if self.inside * independent >= binom.ppf(_BY_CHANCE, independent, _INSIDE):
-            return ""
+            if self.inside > _NEARLY:
+                return ""
+            return (
+                f"{few} The errors change so slowly that about {independent} of them are "
+                "independent, so this may be chance. Compare with a longer record."
+            )
         mean = float(np.mean(np.concatenate(self.errors)))
         if mean**2 > _CONSTANT * self.rms**2 or mean**2 > _CONSTANT * (self.rms**2 - 1.0) > 0.0:
             place = "above" if self.mean_error > 0.0 else "below"
@@ -113,5 +121,4 @@ class BandCheck:
                 "The model does not describe this record within its uncertainty, or slow "
                 "disturbances are larger than in the record of the fit"
             )
-        percent = f"{100.0 * self.inside:.4g}"
-        return f"Only {percent} % of the samples are inside the band of 95 %. {cause}."
+        return f"{few} {cause}."

@@ -169,3 +169,16 @@ def test_a_planar_hasel_that_seems_to_become_shorter_is_noted(
     code, out, _ = fitted(capsys, "--strain", "x", "--actuator", "A.toml")
     assert code == 0 and slope(out) == pytest.approx(sign * SLOPE_PER_F, rel=0.01)
     assert ("The strain falls as the capacitance rises" in out) == noted
+
+
+def test_noise_of_the_capacitance_is_no_part_that_the_map_does_not_follow(
+    capacitance: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    strain_file("t;x", 1.0, STRAIN)
+    farad = 5e-10 + STRAIN / SLOPE_PER_F + 5e-12 * RNG.standard_normal(STRAIN.size)
+    rows = np.column_stack([TIME_S[::5], farad[::5]])
+    np.savetxt(capacitance, rows, "%.9g", ",", header="time_s,capacitance_f", comments="")
+    code, _, err = fitted(capsys, "--strain", "x", "--actuator", "A.toml")
+    assert code == 0
+    assert "have about the same strains, as by noise of the capacitance" in err
+    assert "hardly changes with the capacitance" not in err

@@ -29,6 +29,7 @@ from haselab.store.session.reader import SessionReader, session_file
 __all__ = ["Pairs", "read_pairs", "save_strain_map", "save_voltage_map"]
 
 _LEAST_ROWS = 32
+_FEW = 0.05  # share of the samples, and of the strains, that a limited map may leave out unnoticed
 
 Floats = NDArray[np.float64]
 
@@ -190,12 +191,21 @@ def save_strain_map(actuator: Path, pairs: Pairs, files: Sequence[Path]) -> Mapp
         )
     found = fit_strain_map(pairs.capacitance, pairs.strain)
     if found.limits_f is not None and found.range_f is not None:
+        c, e = pairs.capacitance, pairs.strain
         low_f, high_f = found.range_f
+        inside = (c >= low_f) & (c <= high_f)
+        beyond = float(np.mean(~inside))
+        few = beyond < _FEW and np.ptp(e[inside]) > (1.0 - _FEW) * np.ptp(e)
+        why = (
+            f"the {100.0 * beyond:.2g} % of the samples beyond have about the same strains, as by "
+            "noise of the capacitance or a strain that stays at its end"
+            if few
+            else "no line, parabola or cubic follows the strain over the whole record, which "
+            "hardly changes with the capacitance there, or turns"
+        )
         click.echo(
             f"haselab: the map is limited to {1e12 * low_f:.4g} to {1e12 * high_f:.4g} pF of "
-            f"{1e12 * pairs.capacitance.min():.4g} to {1e12 * pairs.capacitance.max():.4g} pF: no "
-            "line, parabola or cubic follows the strain over the whole record, which hardly "
-            f"changes with the capacitance there, or turns. {files[0]}",
+            f"{1e12 * c.min():.4g} to {1e12 * c.max():.4g} pF: {why}. {files[0]}",
             err=True,
         )
     section = strain_map_section(found)

@@ -218,7 +218,11 @@ def strains_of(
     elif (
         float(np.nanmin(np.abs(values))) < _NEAREST_ZERO * zero_m and max(-least, largest) < zero_m
     ):
+        sensor_m = known.actuator.geometry.sensor_zero_m if known is not None else None
         what, strain = "displacement / zero_length_m", values / zero_m
+        if sensor_m is not None:
+            what = f"(displacement + {sensor_m:g} m) / zero_length_m - 1"
+            strain = (values + sensor_m) / zero_m - 1.0
     else:
         raise InputError(
             f"Column {column} is from {least:.4g} to {largest:.4g} m, but the length at strain 0 "

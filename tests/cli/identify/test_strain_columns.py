@@ -157,6 +157,19 @@ def main_ok(*words: str) -> None:
     assert stop.value.code == 0
 
 
+def test_a_sensor_may_read_zero_at_another_length_than_strain_0(
+    capacitance: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """A laser that was set to zero at 0 V, where the length is 0.058 m."""
+    Path("A.toml").write_text(ACTUATOR + "sensor_zero_m = 0.058\n")
+    strain_file("t;Laser [mm]", 1.0, 1e3 * (ZERO_M * (1.0 + STRAIN) - 0.058))
+    code, out, err = fitted(capsys, "--strain", "Laser", "--actuator", "A.toml", "--json")
+    assert code == 0 and "strain = (displacement + 0.058 m) / zero_length_m - 1" in err
+    found = json.loads(out)
+    assert found["slope"]["value"] == pytest.approx(SLOPE_PER_F, rel=0.01)
+    assert found["offset"]["value"] == pytest.approx(-5e-10 * SLOPE_PER_F, rel=0.01)
+
+
 @pytest.mark.parametrize(
     ("kind", "sign", "noted"),
     [("planar-hasel", -1.0, True), ("planar-hasel", 1.0, False), ("peano-hasel", -1.0, False)],
@@ -175,7 +188,8 @@ def test_noise_of_the_capacitance_is_no_part_that_the_map_does_not_follow(
     capacitance: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     strain_file("t;x", 1.0, STRAIN)
-    farad = 5e-10 + STRAIN / SLOPE_PER_F + 5e-12 * RNG.standard_normal(STRAIN.size)
+    noise = np.random.default_rng(7).standard_normal(STRAIN.size)
+    farad = 5e-10 + STRAIN / SLOPE_PER_F + 8e-12 * noise
     rows = np.column_stack([TIME_S[::5], farad[::5]])
     np.savetxt(capacitance, rows, "%.9g", ",", header="time_s,capacitance_f", comments="")
     code, _, err = fitted(capsys, "--strain", "x", "--actuator", "A.toml")

@@ -112,6 +112,7 @@ class Geometry(_Section):
     """Dimensions of the actuator, in m."""
 
     zero_length_m: _Length | None = None  # between the fiducials at zero strain
+    sensor_zero_m: _Length | None = None  # at which a displacement sensor reads 0; none: the above
     width_m: _Length | None = None
     gap_m: _Length | None = None  # thickness of the dielectric
 

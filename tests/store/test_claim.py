@@ -242,7 +242,7 @@ def test_an_empty_file_of_a_killed_program_does_not_block_the_next_one(tmp_path)
         assert other.stdout is not None and other.stdout.readline() == "claimed\n"
         os.utime(path, (0.0, 0.0))
         assert is_occupied(path)  # it has the lock
-        with pytest.raises(InputError), claimed_file(path):
+        with pytest.raises(InputError, match="exists already"), claimed_file(path):
             pass
         other.kill()
     assert is_left_empty(path) and not is_occupied(path)

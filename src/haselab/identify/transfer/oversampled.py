@@ -9,7 +9,6 @@ from dataclasses import replace
 import numpy as np
 from numpy.typing import NDArray
 from scipy.fft import irfft
-from scipy.signal import upfirdn, welch
 
 from haselab.identify.record import Record
 
@@ -63,6 +62,8 @@ def _every(record: Record, share: float) -> int:
         return 1
     if abs(held - round(held)) > 1e-6 or record.y.size > round(held) * record.u.size:
         return 1
+    from scipy.signal import welch  # takes half a second to import
+
     part = record.y.size // _PARTS
     frequency_hz, power = welch(record.y, rate_hz, nperseg=part, detrend="linear")
     noise = float(np.median(power[power.size // 2 :]))
@@ -76,6 +77,8 @@ def _every(record: Record, share: float) -> int:
 
 def _filtered(record: Record, every: int) -> Record:
     """One of `every` outputs of a record, and the input at the same times."""
+    from scipy.signal import upfirdn  # takes half a second to import
+
     rate_hz = 1.0 / record.output_step_s
     held = round(rate_hz / record.input_rate_hz)
     u = np.repeat(record.u, held)[: record.y.size]

@@ -10,9 +10,9 @@ import pytest
 from haselab.base import Estimate, InputError
 from haselab.cli.main import main
 from haselab.cli.readable import readable
+from haselab.control.gains import gain_units
 from haselab.models.actuator import ActuatorTables
 from haselab.pipelines.actuator_bench import refuse_other_kind
-from haselab.pipelines.design.answer import gain_units
 from haselab.rig.twin.config import TwinConfig
 
 STRAIN = np.linspace(-0.04, 0.12, 300)
@@ -70,6 +70,13 @@ def test_gains_have_the_unit_of_input_over_output(
 ) -> None:
     units = gain_units(source, output)
     assert tuple(units.get(name) for name in ("kp", "ki", "kd")) == gains
+
+
+def test_gains_between_strains_say_so_and_an_overshoot_is_one_of_the_step() -> None:
+    units = gain_units("1", "1", strains=True)
+    shown = {name: units[name] for name in ("kp", "ki", "kd", "limits", "step")}
+    assert list(shown.values()) == ["strain/strain", "1/s", "s", "strain", "strain"]
+    assert units["overshoot"] == gain_units("V", "m")["overshoot"] == "of the step"
 
 
 def test_model_design_and_response_state_units(

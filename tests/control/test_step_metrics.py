@@ -53,6 +53,22 @@ def test_the_raw_rise_of_a_ringing_step_is_that_of_its_first_swing():
     assert "so its rise time" in found.trials[0].remark
 
 
+def test_a_swing_that_creep_hides_from_the_overshoot_is_in_the_excess_over_the_reference():
+    """Both swing far beyond the reference; in open loop, creep ends above the first peak."""
+    t = np.arange(4000) / 200.0
+    swing = 1.0 - np.exp(-20.0 * t) + 0.5 * np.exp(-4.0 * t) * np.sin(15.0 * t)
+    closed, creeping = swing, swing + 0.5 * (1.0 - np.exp(-t))
+    assert 1.2 < creeping[:200].max() < creeping[-1]
+    opened, own = (step_metrics(*record(STEP * y, 200.0)) for y in (creeping, closed))
+    assert opened.overshoot.value < 0.01
+    # The peaks of the traces, smoothed over a fifth of the ringing's period.
+    assert opened.peak_excess.value == pytest.approx(creeping.max() - 1.0, abs=0.02)
+    assert own.peak_excess.value == pytest.approx(closed.max() - 1.0, abs=0.02)
+    assert own.peak_excess.value == pytest.approx(own.overshoot.value, abs=0.01)
+    low = step_metrics(*record(0.9 * STEP * (1.0 - np.exp(-t)), 200.0))
+    assert low.peak_excess.value == 0.0
+
+
 @pytest.mark.parametrize("zeta", [0.03, 0.09, 0.15])
 def test_overshoot_of_a_second_order_step_is_the_closed_form(zeta):
     plant = Plant(1.0, 20.0, zeta)

@@ -33,6 +33,10 @@ a2_v = -0.2805
 b2 = -26.92
 [model]
 gain = 0.8
+input = "strain"
+input_unit = "1"
+output = "strain"
+output_unit = "1"
 natural_frequency_rad_s = 28.0
 damping_ratio = 0.15
 [model.covariance]
@@ -48,6 +52,12 @@ kind = "pid"
 [controller.parameters]
 kp = 0.0
 ki = 2.0
+kd = 0.02
+[controller.limits]
+low = -0.01
+high = 0.06
+[controller.predicted]
+overshoot = 0.07
 [controller.margins]
 phase_margin_deg = 60.0
 phase_margin_deg_std = 1.5
@@ -91,6 +101,11 @@ def test_the_page_has_every_section_with_intervals_bands_and_provenance(
     assert re.search(rf"natural_frequency_rad_s\s+28.00\s+\[{low:.2f}, {high:.2f}\]", text)
     # 60 with a standard deviation of 1.5: 57.06 to 62.94
     assert re.search(r"margins.phase_margin_deg\s+60.0\s+\[57.1, 62.9\]\s+°", text)
+    for name, unit in (
+        ("parameters.kp", "strain/strain"), ("parameters.ki", "1/s"), ("parameters.kd", "s"),
+        ("limits.low", "strain"), ("limits.high", "strain"), ("predicted.overshoot", "of the step"),
+    ):  # fmt: skip
+        assert re.search(rf" {name} +\S+ +(— )?{unit} ", text), name
     assert re.search(r"slope_per_f\s+4.900×10⁸\s+\[4.880", text)
     assert "training_output.hashes 256 values: 0, 7, 14, …" in text and "1785" not in text
     assert "one.csv" in text and "identify transfer one.csv" in text

@@ -1,4 +1,5 @@
 import copy
+import html
 import json
 import os
 import re
@@ -8,7 +9,7 @@ from html.parser import HTMLParser
 
 import pytest
 
-from haselab.report import compose_page, read_folder, save_page, write_report
+from haselab.report import compose_page, read_folder, results_table, save_page, write_report
 from haselab.report.numbers import value_text
 
 VOID = {"meta", "br", "link", "img", "input", "hr"}
@@ -214,6 +215,30 @@ def test_step_metrics_stand_below_figure_6(read, documents):
     rows = {cells[0]: cells[1:] for cells in read.rows if cells and cells[0] in metrics}
     assert set(rows) == set(metrics)
     assert rows["PI"][0] == "2.700 [2.541, 2.859] s"
+
+
+def test_the_caption_of_figure_6_defines_the_columns_of_its_table(page):
+    caption = page[page.index("<b>Figure 6.") :].partition("</figcaption>")[0]
+    assert "Rise time: from 10 to 90 %" in caption
+    assert "Overshoot: largest strain beyond the final strain" in caption
+    assert "Settling time" not in caption  # a column that this table does not have
+
+
+def test_the_summary_names_the_own_controller_of_a_study(make_run, documents):
+    results, analysis = copy.deepcopy(documents)
+    results["provenance"]["study"] = {"name": "mine", "control": {"kind": "leaky"}}
+    results["quantities"] += [
+        {"id": "S25.rise_own", "unit": "s", "measured": {"value": None, "std": None,
+         "ci95": [None, None], "unit": "s"}, "note": "no value: no rise; more"},
+        {"id": "S25.error_own", "measured": {"value": 0.01, "std": 0.001,
+         "ci95": [0.008, 0.012], "unit": ""}},
+    ]  # fmt: skip
+    found = write_report(make_run(results, analysis)).read_text(encoding="utf-8")
+    lead = html.unescape(re.search(r'<p class="lead">(.*?)</p>', found, re.DOTALL)[1])
+    assert "the final error with the controller 'leaky' is 0.0100 (95 % interval" in lead
+    assert "rise time with the controller" not in lead
+    text = results_table(results)
+    assert "\nS25.rise_own has no value: no rise\n" in text
 
 
 def test_rows_of_the_recomputed_paper_may_lack_cells(make_run, documents):

@@ -150,3 +150,12 @@ def test_the_decay_under_each_reading_has_the_printed_damping() -> None:
     row = found["evidence"][-1]
     assert row["rad"] == pytest.approx(0.09 * 5.11)
     assert row["hz"] / row["rad"] == pytest.approx(2.0 * math.pi)
+
+
+def test_a_rise_time_without_value_has_its_reason_first() -> None:
+    nothing = Estimate(math.nan, math.nan, (math.nan, math.nan), "s")
+    found = {"S25.rise_pid": nothing, "S25.rise_observer": Estimate.normal(0.1, 0.01, "s")}
+    notes = {row["id"]: row["note"] for row in quantity_rows(found, {"S25.rise_pid": "one"}, HZ)}
+    assert notes["S25.rise_pid"].startswith("no value: averaging out the ringing also removed the")
+    assert "; one; ringing averaged out" in notes["S25.rise_pid"]
+    assert "no value" not in notes["S25.rise_observer"]

@@ -12,7 +12,7 @@ from numpy.typing import ArrayLike, NDArray
 from haselab.base import InputError
 from haselab.controllers import ChosenController, pid_controller
 
-__all__ = ["PidGains", "Saturation", "responses_at", "sampled_responses"]
+__all__ = ["PidGains", "Saturation", "gain_units", "responses_at", "sampled_responses"]
 
 
 @dataclass(frozen=True)
@@ -151,3 +151,29 @@ def responses_at(
     if kd.any():
         response = response + kd * (z - 1.0) / ((tau + period_s) * z - tau)
     return np.asarray(response)
+
+
+def gain_units(source: str, output: str, *, strains: bool = False) -> dict[str, str]:
+    """Units of a design's gains, limits and step, by the units of the model that it controls.
+
+    Args:
+        source: SI unit of the model's input; "1": a pure number; empty: not known.
+        output: likewise of its output.
+        strains: whether input and output are known to be strains.
+    Returns:
+        Units by name; without those that are not known.
+    """
+    relative = ("overshoot", "steady_state_error", "worst_overshoot")
+    known = dict.fromkeys(relative, "of the step")
+    if strains:
+        return known | {"limits": "strain", "step": "strain", "kp": "strain/strain", "ki": "1/s",
+                        "kd": "s"}  # fmt: skip
+    known |= {"limits": source, "step": output}
+    if source and output:
+        over = "" if output == "1" else f"/{output}"
+        above = "1" if source == output else source
+        under = over if source != output else ""
+        known["kp"] = above + under if above + under != "1" else ""
+        known["ki"] = f"{above}/({output} s)" if under else f"{above}/s"
+        known["kd"] = f"{above} s{under}" if above != "1" else f"s{under}"
+    return {name: unit for name, unit in known.items() if unit}

@@ -32,6 +32,9 @@ class StepNumbers:
         settling_time_s: time from the step after which the response stays within 2 % of the step
             around its final value, in s; NaN if it still leaves that band in the last tenth.
         steady_state_error: reference minus final value, relative to the reference's step.
+        peak_excess: largest excess over the reference, relative to the reference's step, including
+            ringing; 0 if the response stays below. It compares responses that end at different
+            values, as in open loop, where the overshoot over a value raised by creep is small.
     """
 
     rise_time_s: float
@@ -40,6 +43,7 @@ class StepNumbers:
     ring_averaged_overshoot: float
     settling_time_s: float
     steady_state_error: float
+    peak_excess: float
 
     @property
     def remark(self) -> str:
@@ -68,6 +72,7 @@ class StepMetrics:
         ring_averaged_overshoot: relative to the step.
         settling_time_s: in s.
         steady_state_error: relative to the step.
+        peak_excess: relative to the step.
         ringing: ringing that was averaged out, None without ringing.
         trials: metrics of each trial.
     """
@@ -78,6 +83,7 @@ class StepMetrics:
     ring_averaged_overshoot: Estimate
     settling_time_s: Estimate
     steady_state_error: Estimate
+    peak_excess: Estimate
     ringing: Ringing | None
     trials: tuple[StepNumbers, ...]
 
@@ -135,6 +141,7 @@ def step_metrics(
         ring_averaged_overshoot=over("ring_averaged_overshoot", ""),
         settling_time_s=over("settling_time_s", "s"),
         steady_state_error=over("steady_state_error", ""),
+        peak_excess=over("peak_excess", ""),
         ringing=found,
         trials=numbers,
     )
@@ -183,6 +190,7 @@ def step_numbers(
         ring_averaged_overshoot=max(0.0, float(averaged.max()) / final - 1.0),
         settling_time_s=settled / rate_hz if settled < moved.size - last.size else math.nan,
         steady_state_error=(wanted - final) / size,
+        peak_excess=max(0.0, (float(clean.max()) - wanted) / size),
     )
 
 

@@ -19,16 +19,15 @@ DEFORMATIONS = ("uniaxial", "pure_shear", "equibiaxial", "fixed_lateral", "prest
 class Deformation:
     r"""Kind of deformation in a test.
 
-    | kind | length | width |
-    |---|---|---|
-    | `uniaxial` | $\lambda$ | free, $1/\sqrt\lambda$ |
-    | `pure_shear` | $\lambda$ | held, 1 |
-    | `equibiaxial` | $\lambda$ | $\lambda$ |
-    | `fixed_lateral` | $\lambda$ | clamped at `lateral_stretch` |
-    | `prestretched` | $\lambda_p \lambda$ | clamped at $\lambda_p$, the `prestretch` of both |
+    - `uniaxial`: length $\lambda$, width free, $1/\sqrt\lambda$.
+    - `pure_shear`: length $\lambda$, width held at 1.
+    - `equibiaxial`: length and width $\lambda$.
+    - `fixed_lateral`: length $\lambda$, width clamped at `lateral_stretch`.
+    - `prestretched`: length $\lambda_p \lambda$, width clamped at $\lambda_p$, the `prestretch` of
+      both.
 
     Args:
-        kind: one of the kinds in the table.
+        kind: one of these kinds.
         lateral_stretch: stretch of a clamped width.
         prestretch: stretch of length and width at which the recorded stretch is 1.
     Raises:

@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, field
 from importlib import resources
+from types import MappingProxyType
 from typing import Any
 
 import jinja2
@@ -66,6 +67,7 @@ class ActuatorReport:
         plant: of `[model]`; None: there is no model yet.
         posterior: parameters of the plant with their covariance; None: there is none.
         doubts: by section, why its numbers are not those of this actuator.
+        units: of the controller's gains and limits, by name, see `gain_units`.
     """
 
     sections: Mapping[str, Any]
@@ -73,6 +75,7 @@ class ActuatorReport:
     plant: Plant | RationalModel | None = None
     posterior: PlantPosterior | None = None
     doubts: Mapping[str, str] = field(default_factory=dict)
+    units: Mapping[str, str] = field(default_factory=dict)
 
 
 @dataclass(frozen=True)
@@ -170,16 +173,16 @@ def _rows_of(report: ActuatorReport, name: str) -> Iterator[Row]:
         return
     left_out = {"strain_map", "voltage_map"} | _NOT_SHOWN
     shown = {key: item for key, item in table.items() if key not in left_out}
-    known = _intervals(report, name)
+    known, units = _intervals(report, name), report.units if name == "controller" else {}
     for key, estimate in known.items():
         yield _row(key, estimate)
     for key, item in _flat(shown):
         if key not in known:
-            yield _row(key, item)
+            yield _row(key, item, units)
     for alternative in table.get("alternatives", ()) if name == "controller" else ():
         title = f"alternative {alternative.get('kind', '')}"
         for key, item in _flat({"parameters": alternative.get("parameters", {})}):
-            yield _row(f"{title}: {key}", item)
+            yield _row(f"{title}: {key}", item, units)
 
 
 def _flat(table: Mapping[str, Any], name: str = "") -> Iterator[tuple[str, Any]]:
@@ -199,13 +202,16 @@ def _flat(table: Mapping[str, Any], name: str = "") -> Iterator[tuple[str, Any]]
             yield place, item
 
 
-def _row(key: str, item: Any) -> Row:
+def _row(key: str, item: Any, units: Mapping[str, str] = MappingProxyType({})) -> Row:
+    """One row; `units` has those that a name does not end with."""
     if isinstance(item, Estimate):
         shown = value_text(item.to_dict() | {"unit": ""})
         value, _, interval = shown.partition(" [")
         return key, item.unit, value, f"[{interval}" if interval else "—"
     is_number = not isinstance(item, (str, bool))
-    return key, _unit(key) if is_number else "", value_text(item), ""
+    table, _, last = key.rpartition(".")
+    unit = _unit(key) or units.get(last if last not in ("low", "high") else table, "")
+    return key, unit if is_number else "", value_text(item), ""
 
 
 def _unit(key: str) -> str:

@@ -9,6 +9,7 @@ from pathlib import Path
 import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
+from numpy.typing import NDArray
 
 from haselab.base import InputError
 from haselab.base.chart import Chart, Curve, Panel
@@ -90,7 +91,7 @@ def _draw_panel(axes: Axes, panel: Panel) -> None:
 
 
 def _draw_curve(axes: Axes, curve: Curve, colour: str) -> None:
-    every = thinned(curve.x.size, _MOST_SAMPLES)
+    every = _drawn(curve.y)
     x, y = curve.x[every], curve.y[every]
     label = label_text(curve.label) if curve.label else None
     if curve.style == "bars":
@@ -101,8 +102,22 @@ def _draw_curve(axes: Axes, curve: Curve, colour: str) -> None:
     else:
         drawn = "steps-post" if curve.style == "steps" else "default"
         axes.plot(x, y, color=colour, drawstyle=drawn, label=label)
+        alone = _alone(y)
+        axes.plot(x[alone], y[alone], ".", color=colour, markersize=4.0)
     if curve.std is not None:
         band(axes, x, y, _Z95 * np.asarray(curve.std)[every], colour)
+
+
+def _drawn(y: NDArray[np.float64]) -> NDArray[np.intp]:
+    """Indices of the samples to draw: at most so many, all gaps, and each sample between gaps."""
+    some = np.arange(y.size)[thinned(y.size, _MOST_SAMPLES)]
+    return np.union1d(some, np.flatnonzero(np.isnan(y) | _alone(y)))
+
+
+def _alone(y: NDArray[np.float64]) -> NDArray[np.bool_]:
+    """Which samples have gaps or ends on both sides, so that a line does not show them."""
+    empty = np.r_[True, np.isnan(y), True]
+    return np.asarray(~empty[1:-1] & empty[:-2] & empty[2:])
 
 
 def write_chart(chart: Chart, path: Path) -> None:

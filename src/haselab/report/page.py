@@ -26,9 +26,23 @@ _METRICS = {
     "rise_time_s": "Rise time 10–90 %",
     "settling_time_s": "Settling time",
     "overshoot": "Overshoot, including ringing",
+    "peak_excess": "Peak beyond desired strain",
     "error": "Final error",
     "delay_s": "Delay",
     "phase_margin_deg": "Phase margin (°)",
+}
+# Read as one paragraph, in the table's order of columns.
+_DEFINITIONS = {
+    "rise_time_s": "The way of a step leads from the strain before it to the final strain, the "
+    "mean of the record's last tenth. Rise time: from 10 to 90 % of the way, with the ringing "
+    "averaged out.",
+    "settling_time_s": "Settling time: from the step until the strain stays within 2 % of the "
+    "way around the final strain.",
+    "overshoot": "Overshoot: largest strain beyond the final strain, as a fraction of the way.",
+    "peak_excess": "Peak beyond desired strain: largest strain beyond the desired strain, as a "
+    "fraction of the desired step. Compare modes by it: in open loop, creep raises the final "
+    "strain, which hides the ringing from the overshoot.",
+    "error": "Final error: desired minus final strain, as a fraction of the desired step.",
 }
 
 
@@ -223,7 +237,13 @@ def _step_metrics(steps: Any) -> dict[str, Any] | None:
     named = {name: cells for name, cells in groups.items() if isinstance(cells, Mapping)}
     keys = [key for key in _METRICS if any(key in cells for cells in named.values())]
     rows = [(name, [cells.get(key) for key in keys]) for name, cells in named.items()]
-    return {"columns": [_METRICS[key] for key in keys], "rows": rows} if keys else None
+    if not keys:
+        return None
+    return {
+        "columns": [_METRICS[key] for key in keys],
+        "rows": rows,
+        "definitions": " ".join(_DEFINITIONS[key] for key in keys if key in _DEFINITIONS),
+    }
 
 
 def _flat(name: str, value: Any) -> Iterator[tuple[str, str]]:

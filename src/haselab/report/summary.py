@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+import math
+from collections.abc import Mapping, Sequence
 
 from haselab.report.numbers import value_text
 from haselab.report.results import VERDICTS, Quantity, Results
@@ -12,6 +13,9 @@ __all__ = ["counted", "summary_text", "verdict_counts"]
 _MAIN = (
     ("S20.omega_n", "The natural frequency of the fast mode is {}"),
     ("S20.zeta", "its damping ratio is {}"),
+    ("S25.rise_own", "the rise time with the controller {kind} is {}"),
+    ("S25.overshoot_own", "the overshoot with the controller {kind} is {}"),
+    ("S25.error_own", "the final error with the controller {kind} is {}"),
     ("S24.rise_open", "the open-loop rise time is {}"),
     ("S24.rise_closed", "the closed-loop rise time is {}"),
     ("S24.error_open", "the open-loop final error is {}"),
@@ -39,7 +43,12 @@ def summary_text(results: Results) -> str:
     if not rows:
         return "The folder contains no results."
     found = [(results.get(identifier), text) for identifier, text in _MAIN]
-    clauses = [text.format(_in_words(row)) for row, text in found if row and row.measured]
+    kind = _own_kind(results)
+    clauses = [
+        text.format(_in_words(row), kind=kind)
+        for row, text in found
+        if row and row.measured and not math.isnan(row.measured.value)
+    ]
     sentences = ["; ".join(clauses)] if clauses else []
     if any(row.paper is not None for row in rows):
         sentences.append(_verdicts(rows, results.simulated))
@@ -53,6 +62,14 @@ def summary_text(results: Results) -> str:
             "the table of results"
         )
     return " ".join(sentence[0].upper() + sentence[1:] + "." for sentence in sentences)
+
+
+def _own_kind(results: Results) -> str:
+    """The kind of the study's own controller, in quotation marks."""
+    study = results.provenance.get("study")
+    control = study.get("control") if isinstance(study, Mapping) else None
+    kind = control.get("kind") if isinstance(control, Mapping) else None
+    return f"'{kind}'" if kind else "of [control] kind"
 
 
 def _in_words(row: Quantity) -> str:

@@ -68,6 +68,7 @@ def results_table(results: Mapping[str, Any], *, columns: int = 100) -> str:
             *lines,
             "",
             *_missing(found, columns),
+            *_empty(found, columns),
             *_blind(found, columns),
             *textwrap.wrap(_count(found), columns, break_on_hyphens=False),
         ]
@@ -146,6 +147,19 @@ def _blind(results: Results, columns: int) -> list[str]:
         return []
     text = f"not identifiable, so use no number alone (reasons in the report): {', '.join(ids)}"
     return textwrap.wrap(text, columns, subsequent_indent="  ", break_on_hyphens=False)
+
+
+def _empty(results: Results, columns: int) -> list[str]:
+    """Lines that give the reason why a row has no value, the first part of its note."""
+    notes = [(row.id, row.note.partition("; ")[0]) for row in results.quantities]
+    return [
+        line
+        for key, note in notes
+        if note.startswith("no value: ")
+        for line in textwrap.wrap(
+            f"{key} has {note}", columns, subsequent_indent="  ", break_on_hyphens=False
+        )
+    ]
 
 
 def _missing(results: Results, columns: int) -> list[str]:

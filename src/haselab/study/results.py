@@ -36,6 +36,11 @@ VERDICT_RULE = (
     "number is 0), or within the printed range. Disagrees: the whole interval is outside. "
     "Inconclusive: the interval is partly inside."
 )
+# The only reason for which `step_metrics` gives no rise time.
+_NO_RISE = (
+    "no value: averaging out the ringing also removed the rise, because the first swing is most of "
+    "the rise (see the overshoot, and the figure of the steps)"
+)
 _PRINTED_ZETA = 0.09  # eq. 10
 # Played by `reproduce` beside the experiments.
 _APART = (
@@ -107,6 +112,8 @@ def quantity_rows(
         quantity = named if compared else named.without_paper()
         estimate = measured[key]
         parts = [notes[key]] if key in notes else []
+        if quantity.name.startswith("rise time") and math.isnan(estimate.value):
+            parts.insert(0, _NO_RISE)
         parts += [note for note in (quantity.note, quantity.paper_note) if note]
         row: dict[str, Any] = {
             "id": key,

@@ -215,6 +215,7 @@ def test_a_wrong_serial_number_stops_the_check_and_is_found_by_the_doctor(
     assert code == 2 and err.count("\n") == 1
     assert out.splitlines()[-1].startswith("FAILED") and out.count("FAILED") == 1
     assert "generator has the serial number MY00000001" in err
+    assert "generator has the serial number MY00000001" in out.splitlines()[-1]
     code, out, _ = call(capsys, "doctor", "--rig", other, "--json")
     found = {f["name"]: f for f in json.loads(out)["findings"] if f["kind"] == "instrument"}
     assert code == 0

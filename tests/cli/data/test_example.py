@@ -56,6 +56,7 @@ def test_a_package_is_a_copy_of_the_example_that_the_tests_install(tmp_path, cap
     assert {"pyproject.toml", "README.md"} <= {file.name for file in files}
     assert not any("__pycache__" in file.parts for file in files)
     for file in files:
+        assert file.suffix != ".md" or "](.." not in file.read_text()  # no link out of the copy
         assert file.read_bytes() == (source / file.relative_to(tmp_path / "mine")).read_bytes()
 
 

@@ -535,5 +535,11 @@ def test_a_capacitance_map_shows_one_slope(tmp_path, capsys):
     assert code_of(*asked) == 0
     shown = capsys.readouterr().out
     assert shown.count("slope") == 1
-    assert "cubic map with its band, for loops: written to [sensing.strain_map]" in shown
-    assert "slope_per_f" in answer_of(capsys, *asked)["strain_map"]
+    low, high = (written := answer_of(capsys, *asked)["strain_map"])["band"]
+    # Noise of 2e-13 F over 1e-9 F per unit of strain: 2e-4, of which 1.96 are the band.
+    assert -low == pytest.approx(3.9e-4, rel=0.25) and high == pytest.approx(3.9e-4, rel=0.25)
+    assert (
+        f"map for loops: 95 % of strains within {low:+.2g} to {high:+.2g} of it; written to "
+        "[sensing.strain_map]"
+    ) in shown
+    assert "slope_per_f" in written

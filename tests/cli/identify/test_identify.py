@@ -125,6 +125,7 @@ def test_regions_and_maps_answer_with_the_keys_of_the_contract(tmp_path):
     volts = VoltageMap(1.324, 3.124, -0.2805, -26.92).voltage_v(strain)
     volts = volts + 0.01 * rng.normal(size=strain.size)
     answer = ask("voltage-map", write(tmp_path / "v.csv", strain=strain, voltage_v=volts))
+    assert next(iter(answer)) == "residual_std_v"
     assert {"a1_v", "b1", "a2_v", "b2", "monotone", "hysteresis_width", "r_squared"} <= set(answer)
     assert answer["monotone"] is True
 

@@ -110,6 +110,9 @@ def test_a_voltage_map_takes_displacements_too(
                   "A.toml"])  # fmt: skip
         assert stop.value.code == 0
         lines = capsys.readouterr().out.splitlines()
+        # The accuracy of the map comes first, then the coefficients.
+        assert [line.split()[0] for line in lines[:2]] == ["residual_std_v", "hysteresis_width"]
+        assert lines[1].endswith(" V")
         found.append([line.split()[1] for line in lines if line[:2] in ("a1", "b1", "a2", "b2")])
     assert found[0] == found[1] and found[0]
 
@@ -133,7 +136,9 @@ def test_through_the_voltage_map_a_displacement_has_the_model_of_its_strain(
                    header=f"time_s,U,x [{unit}]", comments="")  # fmt: skip
         main_ok("identify", "transfer", "R.csv", "--input", "U", "--output", "x",
                 "--through-voltage-map", "--actuator", "A.toml", "--json", "--force")  # fmt: skip
-        gains.append(json.loads(capsys.readouterr().out)["gain"]["value"])
+        answer = json.loads(capsys.readouterr().out)
+        assert (answer["input"], answer["output"]) == ("strain", "strain")
+        gains.append(answer["gain"]["value"])
     assert gains[0] == pytest.approx(gains[1], rel=1e-6)
     # Without a unit: refused if it cannot be a strain, and a warning if the gain is far from 1.
     for scale, code, said in (

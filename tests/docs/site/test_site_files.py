@@ -75,6 +75,16 @@ def test_every_link_leads_to_a_file_and_an_anchor(site: Path) -> None:
     assert not broken, "\n".join(broken)
 
 
+def test_no_page_shows_a_raw_row_of_a_table(site: Path) -> None:
+    """As below an empty line in a Markdown table, or in a docstring, which has no tables."""
+    raw = [
+        f"{page.relative_to(site)}: {row}"
+        for page in _pages(site)
+        for row in re.findall(r"<p>\s*(\|.*)", page.read_text(encoding="utf-8"))
+    ]
+    assert not raw, "\n".join(raw)
+
+
 def test_nothing_comes_from_another_host(site: Path) -> None:
     foreign = [
         f"{page.relative_to(site)}: <{tag}> {address}"

@@ -268,6 +268,33 @@ def test_the_figure_has_the_response_the_fit_and_their_bands():
     assert [each.get_ylabel() for each in axes] == ["Magnitude", "Phase (°)", "Coherence"]
 
 
+def test_a_line_far_above_the_band_is_a_band_of_its_own_and_no_curve_leads_to_it():
+    u = SWEEP + np.sin(2 * np.pi * 150.0 * TIME_S)
+    found = estimate(u, PLANT.simulate(u, 400.0, TIME_S), 400.0)
+    assert len(found.bands) == 2 and found.bands[1].start == found.frequency_hz.size - 1
+    (note,) = [each for each in found.notes if "separate bands" in each]
+    top_hz = found.frequency_hz[-2]
+    assert 9.0 < top_hz < 20.0 and f" to {top_hz:.4g}, 150 Hz. Between them" in note
+    for panel in found.chart(found.response).panels:
+        for curve in panel.curves:
+            assert np.flatnonzero(np.isnan(curve.y)).tolist() == [curve.y.size - 2]
+    magnitude, *_ = found.plot().axes
+    alone = [line for line in magnitude.lines if line.get_marker() == "."]
+    assert [line.get_xdata().tolist() for line in alone] == [[150.0]]
+
+
+@pytest.mark.parametrize(
+    "lines", [np.arange(1, 80, 2), np.unique(np.geomspace(1, 1000, 30).round().astype(int))]
+)
+def test_sparse_lines_without_a_gap_are_one_band(lines):
+    """Odd lines alone, whose first step is an octave and a half, and lines a tenth of a decade."""
+    turn = 2.0 * np.pi * np.outer(lines, np.arange(4000)) / 4000
+    u = np.cos(turn + np.arange(lines.size)[:, None] ** 2).sum(axis=0)
+    found = estimate(u, PLANT.simulate(u, 400.0, TIME_S), 400.0)
+    assert len(found.bands) == 1 and not any("separate" in note for note in found.notes)
+    assert all(np.isfinite(panel.curves[0].y).all() for panel in found.chart().panels)
+
+
 @pytest.mark.long
 def test_the_hold_of_the_input_is_taken_out_or_left_in():
     u = np.random.default_rng(3).normal(size=2000)

@@ -60,6 +60,19 @@ def test_trials_that_a_study_leaves_out_are_named_with_their_setting(
     assert found == {"ids": [key], "reason": f"steps.{setting} is 0 in this study."}
 
 
+def test_trials_of_number_0_are_not_missing_for_the_reason_that_the_fit_states() -> None:
+    """A study without a plant has no design, but its PI trials were left out before that."""
+    steps = REFERENCE.steps.model_copy(update={"pi_trials": 0})
+    study = REFERENCE.model_copy(update={"steps": steps})
+    keys = {"S24.error_closed", "S25.error_pid"}
+    why = dict.fromkeys(keys, "needs [chirp], which is not in this study")
+    found = not_played(set(quantities()) - keys, {}, study, why)
+    assert found == [
+        {"ids": ["S24.error_closed"], "reason": "steps.pi_trials is 0 in this study."},
+        {"ids": ["S25.error_pid"], "reason": "needs [chirp], which is not in this study"},
+    ]
+
+
 def test_the_reference_study_on_a_default_twin_has_no_changes() -> None:
     for reading in ("hz", "rad"):
         assert changes_text(header(twin=twin_of_reading(reading))) == ""

@@ -353,7 +353,7 @@ def check(
         if not checks or checks[-1].passed:
             step = checks[-1].step if checks else "mock"
             checks.append(CheckResult(step, "bench", str(error), False))
-            _print_check(replace(checks[-1], found="see the error message"), as_json)
+            _print_check(checks[-1], as_json)
         raise
     except KeyboardInterrupt as stop:
         if live and not getattr(stop, "__notes__", []):  # the interrupt came between two checks

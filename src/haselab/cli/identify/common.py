@@ -51,6 +51,7 @@ __all__ = [
     "axis_names",
     "emit_fit",
     "name_files_in_errors",
+    "output_name",
     "rate_hz_of",
     "read_columns",
     "read_quantities",
@@ -110,10 +111,11 @@ def emit_fit(
     out: Path | None,
     more: Mapping[str, Any] | None = None,
     shorter: Mapping[str, Any] | None = None,
+    units: Mapping[str, str] | None = None,
 ) -> None:
     """Print the answer and the keys `more`; without a result, end the command with code 3.
 
-    The readable lines have `shorter` in place of long parts of the answer.
+    The readable lines have `shorter` in place of long parts of the answer, and `units`, by name.
     """
     if not fit.succeeded:
         listed = " ".join(str(file) for file in files)
@@ -122,7 +124,7 @@ def emit_fit(
         raise ResultError(f"{fit.status}: {listed}")
     answer = {**fit.answer(), **(more or {})}
     shown = {name: text for name, text in _SHORTER.items() if answer.get(name) is not None}
-    emit(answer, as_json=as_json, out=out, shorter={**shown, **(shorter or {})})
+    emit(answer, as_json=as_json, out=out, shorter={**shown, **(shorter or {})}, units=units)
 
 
 @contextmanager
@@ -273,10 +275,21 @@ def axis_names(source: str, output: str, units: tuple[str, str] | Table) -> tupl
     if isinstance(units, Table):
         units = (_unit(units, source), _unit(units, output))
     first, second = (
-        name if unit in ("", "1") else f"{name} ({unit})"
+        "Strain" if name == "strain" else name if unit in ("", "1") else f"{name} ({unit})"
         for name, unit in zip((source, output), units, strict=True)
     )
     return first, second
+
+
+def output_name(output: str, unit: str, through_map: bool) -> str:
+    """Name of a model's output: the column, or "strain" where the voltage map made it one.
+
+    Args:
+        output: name of the column.
+        unit: SI unit of the values that were fitted; empty: not known.
+        through_map: whether the input was converted to a strain, so that a pure number is one too.
+    """
+    return "strain" if through_map and unit in ("", "1") else output
 
 
 def unit_text(unit: str) -> str:

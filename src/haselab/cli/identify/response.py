@@ -125,7 +125,9 @@ def _peak(response: FrequencyResponse, unit: str) -> dict[str, Any]:
         return {}
     at = int(np.argmax(np.where(known, size, -np.inf)))
     return {
-        "range_hz": [float(hz.min()), float(hz.max())],
+        "range_hz": [float(hz.min()), float(hz.max())]
+        if len(response.bands) == 1
+        else response.bands_text,
         "peak_frequency_hz": float(hz[at]),
         "peak_magnitude": Estimate.normal(float(size[at]), float(response.magnitude_std[at]), unit),
     }

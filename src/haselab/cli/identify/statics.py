@@ -48,7 +48,6 @@ __all__ = ["capacitance_map", "hyperelastic", "regions", "voltage_map"]
 
 Floats = NDArray[np.float64]
 _KINDS = {kind.replace("_", "-"): kind for kind in DEFORMATIONS}
-_FOR_LOOPS = "cubic map with its band, for loops: written to [sensing.strain_map]"
 _LOWEST = shared_option("--stretch-min", type=REAL, detail="Default: no limit.")
 _HIGHEST = shared_option("--stretch-max", type=REAL, detail="Default: no limit.")
 
@@ -266,7 +265,7 @@ def voltage_map(
     if fit.succeeded and (known is None or known.drive.gain_v_per_v is None):
         name = VOLTAGE.column(file, voltage_column)
         fit = replace(fit, notes=(*fit.notes, *_voltage_notes(name, voltage_v, file, columns)))
-    emit_fit(fit, [file], as_json, out)
+    emit_fit(fit, [file], as_json, out, units={"hysteresis_width": "V"})
     if actuator is not None:
         save_voltage_map(actuator, fit, file)
     save_plot(plot, fit.chart)
@@ -323,9 +322,22 @@ def capacitance_map(
     if actuator is not None and fit.succeeded:
         section = save_strain_map(actuator, pairs, files)
         found = {name: part for name, part in section.items() if part is not None}
-        more = {"strain_map": found if as_json or out is not None else _FOR_LOOPS}
+        more = {"strain_map": found if as_json or out is not None else _for_loops(section)}
     emit_fit(fit, files, as_json, out, more)
-    save_plot(plot, fit.chart)
+    axis = "Capacitance (F)" if pairs.in_farads else "Capacitance (as in the file)"
+    if pairs.column.startswith("relative"):
+        axis = "Relative capacitance"
+    save_plot(plot, lambda: fit.chart((axis, "Strain")))
+
+
+def _for_loops(section: Mapping[str, Any]) -> str:
+    """What the screen shows of [sensing.strain_map]: how far a strain can be from the map."""
+    ends = section["band"]
+    band = "" if ends is None else (
+        f"{100.0 * section['coverage']:.0f} % of strains within {ends[0]:+.2g} to {ends[1]:+.2g} "
+        "of it; "
+    )  # fmt: skip
+    return f"map for loops: {band}written to [sensing.strain_map]"
 
 
 def _slope_notes(fit: CapacitanceMapFit, known: ActuatorTables | None) -> tuple[str, ...]:

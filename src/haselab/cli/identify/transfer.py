@@ -22,6 +22,7 @@ from haselab.cli.identify.common import (
     axis_names,
     emit_fit,
     name_files_in_errors,
+    output_name,
     read_recorded,
     refuse_copies,
     unit_text,
@@ -184,7 +185,8 @@ def transfer(
         else:
             found = fit = fit_transfer(records, structure)
     modelled = "strain" if options["through_voltage_map"] else source
-    more: dict[str, Any] = {"input": modelled, "output": output}
+    measured = output_name(output, units[1], options["through_voltage_map"])
+    more: dict[str, Any] = {"input": modelled, "output": measured}
     more |= {f"{end}_unit": unit for end, unit in zip(more, units, strict=True) if unit}
     if all(units):
         more["gain_unit"] = units[1] if units[0] == "1" else f"{units[1]}/{units[0]}"
@@ -199,8 +201,8 @@ def transfer(
     if options["through_voltage_map"] and fit.succeeded:
         _warn_of_gain(fit, output, units[1])
     if actuator is not None:
-        _save(actuator, fit, (modelled, output), units, files, options["through_voltage_map"])
-    save_plot(plot, lambda: fit.chart(axis_names(modelled, output, units)))
+        _save(actuator, fit, (modelled, measured), units, files, options["through_voltage_map"])
+    save_plot(plot, lambda: fit.chart(axis_names(modelled, measured, units)))
 
 
 def _save(

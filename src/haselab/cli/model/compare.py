@@ -20,6 +20,7 @@ from haselab.cli.identify.common import (
     RATE,
     axis_names,
     name_files_in_errors,
+    output_name,
     read_recorded,
     unit_of_name,
     unit_text,
@@ -172,7 +173,8 @@ def command(
             )  # fmt: skip
             _check_units(origin, found.units, (source, output), through_voltage_map)
             records += found.records
-            axes = axis_names(source, output, found.units)
+            measured_name = output_name(output, found.units[1], through_voltage_map)
+            axes = axis_names(source, measured_name, found.units)
     with name_files_in_errors(*files):
         prediction = predict(
             plant,

@@ -25,6 +25,7 @@ from haselab.control import (
     margins,
 )
 from haselab.control.charts import loop_chart
+from haselab.control.gains import gain_units
 from haselab.control.plants.general import AnyPlant
 from haselab.control.plausible_design import USUAL_STRUCTURE
 from haselab.controllers import (
@@ -36,7 +37,6 @@ from haselab.controllers import (
 from haselab.models.posterior import PlantPosterior
 from haselab.pipelines.design.answer import (
     design_answer,
-    gain_units,
     margins_answer,
     plausible_sentence,
 )
@@ -171,7 +171,8 @@ def command(
         click.echo(f"haselab: warning: {remark}: {model}", err=True)
     origin = read_origin(model)
     ends = origin.input_unit, origin.output_unit
-    emit(answer, as_json=as_json, out=None, units=gain_units(*ends))
+    units = gain_units(*ends, strains=origin.is_of_strains)
+    emit(answer, as_json=as_json, out=None, units=units)
     names = axis_names("Controller output", "Output", ends)
     save_plot(plot, lambda: design.chart(names))
 

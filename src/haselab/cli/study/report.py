@@ -13,8 +13,9 @@ from haselab.cli.actuator_file import load_actuator
 from haselab.cli.common import answer_options, emit
 from haselab.cli.output import OutputRule
 from haselab.cli.study.analyse import check_ends
+from haselab.control.gains import gain_units
 from haselab.models.actuator import ActuatorTables
-from haselab.pipelines.design.model_file import read_any_plant, read_posterior
+from haselab.pipelines.design.model_file import read_any_plant, read_origin, read_posterior
 from haselab.pipelines.design.stated_margins import (
     controller_doubt,
     delay_doubt,
@@ -87,12 +88,16 @@ def _report_actuator(path: Path, page_path: Path, as_json: bool) -> None:
     has_model = tables.model is not None and {"gain", "numerator"} & set(
         tables.model.model_extra or {}
     )
+    origin = read_origin(path) if has_model else None
     report = ActuatorReport(
         read_actuator(path),
         tables,
         read_any_plant(path) if has_model else None,
         read_posterior(path) if has_model else None,
         {"model": model_doubt(path), "controller": _controller_doubts(tables, path)},
+        gain_units(origin.input_unit, origin.output_unit, strains=origin.is_of_strains)
+        if origin
+        else {},
     )
     doubts = {name: doubt for name, doubt in report.doubts.items() if doubt}
     for doubt in doubts.values():

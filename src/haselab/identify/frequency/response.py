@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+import itertools
+import math
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -33,6 +35,7 @@ Floats = NDArray[np.float64]
 Complexes = NDArray[np.complex128]
 RESPONSE_METHODS = ("rational", "polynomial", "h1", "h2", "hv", "periodic")
 _LEAST = 64
+_FAR, _LEAST_STEPS = 10.0, 10  # a gap, in usual distances of lines; to know what is usual
 
 
 @dataclass(frozen=True, repr=False)
@@ -104,6 +107,36 @@ class FrequencyResponse:
         """Magnitude in dB over phase in degrees, with 95 % intervals."""
         return NicholsChart.of(self.frequency_hz, self.response, self.std)
 
+    @property
+    def bands(self) -> tuple[slice, ...]:
+        """Lines of each band that the input excites, between gaps without lines.
+
+        A gap is above an octave, and far wider than usual between two lines: in Hz, and in octaves.
+        """
+        hz = self.frequency_hz
+        first = int(np.count_nonzero(hz <= 0.0))
+        steps, octaves = np.diff(hz[first:]), np.diff(np.log2(hz[first:]))
+        if steps.size < _LEAST_STEPS:
+            return (slice(0, hz.size),)
+        wide = (octaves > 1.0) & (steps > _FAR * np.median(steps))
+        wide &= octaves > _FAR * np.median(octaves)
+        ends = [0, *(first + 1 + np.flatnonzero(wide)), hz.size]
+        return tuple(slice(int(a), int(b)) for a, b in itertools.pairwise(ends))
+
+    @property
+    def bands_text(self) -> str:
+        """Lowest and highest frequency of each band, in Hz."""
+        parts = [self.frequency_hz[band] for band in self.bands]
+        return ", ".join(
+            f"{part[0]:.4g} to {part[-1]:.4g}" if part.size > 1 else f"{part[0]:.4g}"
+            for part in parts
+        )
+
+    def _with_gaps(self, values: Floats) -> Floats:
+        """Values of the lines with NaN between two bands, which breaks a curve there."""
+        starts = [band.start for band in self.bands[1:]]
+        return np.insert(np.asarray(values, dtype=float), starts, math.nan)
+
     def chart(self, fitted: Complexes | None = None, names: tuple[str, str] | None = None) -> Chart:
         """Magnitude, phase and coherence over the frequency as data of a figure.
 
@@ -113,23 +146,31 @@ class FrequencyResponse:
         Returns:
             The chart; without the line at 0 Hz, which a logarithmic axis does not have.
         """
-        used, axis = self.frequency_hz > 0.0, "Frequency (Hz)"
-        hz, std_deg = self.frequency_hz[used], np.degrees(self.phase_std_rad[used])
+        axis = "Frequency (Hz)"
+        starts = [band.start for band in self.bands[1:]]
+        # Between two bands, an abscissa without a value.
+        all_hz = np.insert(self.frequency_hz, starts, self.frequency_hz[starts])
+        used = all_hz > 0.0
+        hz = all_hz[used]
+
+        def drawn(values: Floats) -> Floats:
+            return self._with_gaps(values)[used]
 
         def degrees(response: Complexes) -> Floats:
-            return np.degrees(np.unwrap(np.angle(response)))[used]
+            return drawn(np.degrees(np.unwrap(np.angle(response))))
 
-        size = np.abs(self.response)[used]
-        sizes = [Curve(hz, size, "estimate, 95 %", std=self.magnitude_std[used])]
+        size = drawn(np.abs(self.response))
+        sizes = [Curve(hz, size, "estimate, 95 %", std=drawn(self.magnitude_std))]
+        std_deg = drawn(np.degrees(self.phase_std_rad))
         phases = [Curve(hz, degrees(self.response), std=std_deg)]
         if fitted is not None:
-            sizes.append(Curve(hz, np.abs(fitted[used]), "fit"))
+            sizes.append(Curve(hz, drawn(np.abs(fitted)), "fit"))
             phases.append(Curve(hz, degrees(fitted)))
         magnitude = gain_label("Magnitude", *(names or ("", "")))
         return Chart("Frequency response" if fitted is None else "Frequency response and fit", (
             Panel(axis, magnitude, sizes, log_x=True, log_y=True),
             Panel(axis, "Phase (°)", phases, log_x=True),
-            Panel(axis, "Coherence", (Curve(hz, self.coherence[used]),), log_x=True),
+            Panel(axis, "Coherence", (Curve(hz, drawn(self.coherence)),), log_x=True),
         ))  # fmt: skip
 
     def plot(self) -> Figure:
@@ -278,7 +319,14 @@ def _spectrum(pair: Pair, rate_hz: float, held: bool) -> Spectrum:
 
 
 def _result(lines: Lines, status: str) -> FrequencyResponse:
-    return FrequencyResponse(
+    found = FrequencyResponse(
         lines.frequency_hz, lines.response, lines.coherence, lines.std, lines.distortion_std,
         lines.notes, lines.mixing, status,
     )  # fmt: skip
+    if len(found.bands) == 1:
+        return found
+    note = (
+        f"The input excites separate bands: {found.bands_text} Hz. Between them the response is "
+        "not known."
+    )
+    return replace(found, notes=(*found.notes, note))

@@ -68,6 +68,11 @@ class VoltageMapFit(CurveFit):
         """
         return self._fitted().map
 
+    @property
+    def residual_std_v(self) -> float:
+        """Root mean square of the residuals, in V: accuracy of the map, hysteresis included."""
+        return float(np.sqrt(np.mean(self.residuals[0] ** 2))) if self.residuals else math.nan
+
     def curve_std(self, strain: ArrayLike) -> Floats:
         """Standard deviation of the fitted voltage, in V.
 
@@ -112,10 +117,11 @@ class VoltageMapFit(CurveFit):
     def answer(self) -> JsonObject:
         """The result under its public JSON keys."""
         return {
-            **{name: self.parameters.get(name) for name in _NAMES},
-            "monotone": self.monotone,
+            "residual_std_v": self.residual_std_v,
             "hysteresis_width": self.hysteresis_width,
             "r_squared": self.r_squared,
+            "monotone": self.monotone,
+            **{name: self.parameters.get(name) for name in _NAMES},
             "status": self.status,
             "notes": list(self.notes),
         }

@@ -163,6 +163,11 @@ class OriginTable(_Table):
     training_output: TrainingOutputTable | None = None
     through_voltage_map: tuple[Number, Number, Number, Number] | None = None
 
+    @property
+    def is_of_strains(self) -> bool:
+        """Whether input and output are strains, as after the voltage map."""
+        return (self.input_unit, self.output_unit) == ("1", "1") and self.input.endswith("strain")
+
 
 class VoltagePlantTable(_Table):
     """Drive voltage to output, see `VoltagePlant`."""

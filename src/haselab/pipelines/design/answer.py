@@ -10,7 +10,6 @@ from haselab.control.stability.plausible import PlausibleMargins, binomial_propo
 
 __all__ = [
     "design_answer",
-    "gain_units",
     "margins_answer",
     "plausible_sentence",
 ]
@@ -73,26 +72,6 @@ def _posterior(found: PlausibleMargins) -> dict[str, Any]:
         "least_gain_margin_db": found.least_gain_db,
         **_shares(found),
     }
-
-
-def gain_units(source: str, output: str) -> dict[str, str]:
-    """Units of the numbers of `design_answer` that depend on the model's units.
-
-    Args:
-        source: SI unit of the model's input; "1": a pure number; empty: not known.
-        output: likewise of its output.
-    Returns:
-        Units by name; without those that are not known.
-    """
-    known = {"limits": source, "step": output}
-    if source and output:
-        over = "" if output == "1" else f"/{output}"
-        above = "1" if source == output else source
-        under = over if source != output else ""
-        known["kp"] = above + under if above + under != "1" else ""
-        known["ki"] = f"{above}/({output} s)" if under else f"{above}/s"
-        known["kd"] = f"{above} s{under}" if above != "1" else f"s{under}"
-    return {name: unit for name, unit in known.items() if unit}
 
 
 def design_answer(design: Design) -> JsonObject:

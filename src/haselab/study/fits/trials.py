@@ -278,6 +278,7 @@ def make_comparison(
         name: {
             "rise_time_s": seen(g.metrics.rise_time_s),
             "overshoot": seen(g.metrics.overshoot),
+            "peak_excess": seen(g.metrics.peak_excess, zero_px),
             "error": seen(g.metrics.steady_state_error, zero_px),
             "settling_time_s": seen(g.metrics.settling_time_s),
         }

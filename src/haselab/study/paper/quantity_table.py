@@ -16,10 +16,7 @@ __all__ = ["paper_rows", "quantities"]
 _PAPER_WN_RAD_S = math.sqrt(26.14)
 _PAPER = Plant(0.5, _PAPER_WN_RAD_S, 0.93 / (2.0 * _PAPER_WN_RAD_S))
 _PAPER_PI = PidGains(0.85, 1.5)
-_RISE = (
-    "ringing averaged out; not well defined if the overshoot with ringing is large; no value if "
-    "averaging leaves no rise: see the figure of the steps"
-)
+_RISE = "ringing averaged out; not well defined if the overshoot with ringing is large"
 _ERROR = "fraction of the step; negative: beyond the reference"
 _CALIBRATED_ONCE = (
     "The interval includes differences between the trials, but not the error of the chip's "

@@ -56,9 +56,17 @@ def not_played(
     known = missing or {}
     for key in rows_of(study):
         if key not in measured:
-            reason = known.get(key) or _reason(key, figures, study)
+            reason = _left_out(key, study) or known.get(key) or _reason(key, figures, study)
             found.setdefault(reason, []).append(key)
     return [{"ids": ids, "reason": reason} for reason, ids in found.items()]
+
+
+def _left_out(key: str, study: Study) -> str:
+    """Which number of trials is 0, a cause before any that a fit states; empty if none is."""
+    for setting, keys in _COUNTED.items():
+        if key in keys and study.has("steps") and not getattr(study.steps, setting):
+            return f"steps.{setting} is 0 in this study."
+    return ""
 
 
 def _reason(key: str, figures: Mapping[str, Any], study: Study) -> str:
@@ -70,9 +78,6 @@ def _reason(key: str, figures: Mapping[str, Any], study: Study) -> str:
             return str(reason or "not played")
     if row == "S16" and (left_out := figures.get("static", {}).get("left_out")):
         return str(left_out)
-    for setting, keys in _COUNTED.items():
-        if key in keys and study.has("steps") and not getattr(study.steps, setting):
-            return f"steps.{setting} is 0 in this study."
     if key.startswith("S19.eq6_decay_"):
         return "too few peaks exceed the creep (S19.eq6_omega_0)."
     return "no result from the recorded data."

@@ -105,6 +105,7 @@ def actuator(
             file, replace(options, mass_kg=mass_kg), tables, unverified=unverified, std=std
         )
         if not (file.is_dir() or is_session(file)):
+            record = replace(record, std_estimated=True)
             for unit, stds in (("m", record.length_std_m), ("F", record.capacitance_std_f)):
                 std |= {unit: float(stds[0])} if stds.size else {}
         records.append(record)

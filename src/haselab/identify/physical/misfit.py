@@ -268,11 +268,13 @@ class Segment:
         experiment: its name; empty for what is known beforehand.
         channel: `LENGTH`, `CAPACITANCE` or "known".
         rows: of the residuals.
+        std_estimated: see `MotionRecord`.
     """
 
     experiment: str
     channel: str
     rows: NDArray[np.int64]
+    std_estimated: bool = False
 
 
 @dataclass(frozen=True)
@@ -328,7 +330,7 @@ class Misfit:
                 for k, name in enumerate(record.experiments):
                     rows = at + np.flatnonzero(member == k)
                     if rows.size:
-                        found.append(Segment(name, channel, rows))
+                        found.append(Segment(name, channel, rows, record.std_estimated))
                 at += member.size
         known = np.arange(at, at + len(self.known))
         return [*found, Segment("", "known", known)] if known.size else found

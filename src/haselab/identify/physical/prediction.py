@@ -68,6 +68,19 @@ class ChannelNoise:
         excess = 0.0 if self.explained else self.worst**2 - self.noise**2
         return float(np.sqrt(excess)) if excess > 0.0 else 0.0
 
+    def std_of(self, stated: Floats, estimated: bool) -> Floats:
+        """Standard deviations of the noise of another record.
+
+        Args:
+            stated: of its values, in the unit of the channel. Shape `(N,)`.
+            estimated: whether they are estimates from the values, see `MotionRecord`.
+        Returns:
+            Shape `(N,)`; where they are estimates, the noise of the fit if it is known.
+        """
+        if not estimated:
+            return self.factor * stated
+        return np.full(stated.size, self.noise) if np.isfinite(self.noise) else stated
+
 
 @dataclass(frozen=True)
 class IdentifiedModel:
@@ -378,11 +391,14 @@ def predict_motion(
     def std_of(by: Floats) -> Floats:
         return np.asarray(np.sqrt(np.maximum(((by @ spread) * by).sum(axis=1), 0.0)))
 
-    pixel_m = SHARED_PX * record.pixel_m
-    noise_m = np.hypot(model.length.factor * record.length_std_m, pixel_m)
+    estimated = record.std_estimated
+    noise_m = np.hypot(
+        model.length.std_of(record.length_std_m, estimated), SHARED_PX * record.pixel_m
+    )
     noise_m = np.hypot(noise_m, model.length.model_error)
     noise_f = np.hypot(
-        model.capacitance.factor * record.capacitance_std_f, model.capacitance.model_error
+        model.capacitance.std_of(record.capacitance_std_f, estimated),
+        model.capacitance.model_error,
     )
     wanted = [k for k, name in enumerate(record.experiments)
               if not experiments or name in experiments]  # fmt: skip

@@ -46,6 +46,8 @@ class MotionRecord:
         window_weight: of a second of each interval in its capacitance, shape `(W,)`; empty: all
             weigh the same.
         voltage_ratio: voltage by the monitor over drive times gain; NaN if it was not measured.
+        std_estimated: whether the standard deviations are estimates from the values themselves,
+            and say nothing of those that another record states.
     Raises:
         InputError: Shapes do not fit together, a value is not finite, or a standard deviation is
             not positive.
@@ -69,6 +71,7 @@ class MotionRecord:
     block: Integers = field(default_factory=lambda: np.zeros(0, dtype=np.int64))
     window_weight: Floats = field(default_factory=lambda: np.zeros(0))
     voltage_ratio: float = math.nan
+    std_estimated: bool = False
 
     @cached_property
     def sensed(self) -> NDArray[np.bool_]:

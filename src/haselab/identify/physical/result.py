@@ -33,6 +33,7 @@ from haselab.identify.physical.misstated import WrongScale, misstated_std, scale
 from haselab.identify.physical.model_error import hidden_std, widen_std
 from haselab.identify.physical.record import MotionRecord
 from haselab.identify.physical.residuals import (
+    channel_of,
     channel_residuals,
     noise_of,
     notes_of,
@@ -78,7 +79,8 @@ class ActuatorFit(Fit):
         capacitance_rms_f: of those of the capacitances.
         length_noise_m: from differences of neighbours, which a slow misfit does not change.
         capacitance_noise_f: likewise.
-        length_factor: true over stated standard deviation of the noise of the lengths.
+        length_factor: true over stated standard deviation of the noise of the lengths; 1 if all
+            records are tables, which do not state it.
         capacitance_factor: the same of the capacitances.
         length_worst_m: rms of the residuals in the experiment that the model explains least.
         capacitance_worst_f: the same of the capacitances.
@@ -288,8 +290,10 @@ def result_of(
         length_noise_m=std_m * length_noise,
         capacitance_rms_f=std_f * rms_of(capacitances),
         capacitance_noise_f=std_f * capacitance_noise,
-        length_factor=misfit.length_factor * length_noise,
-        capacitance_factor=misfit.capacitance_factor * capacitance_noise,
+        length_factor=_factor(misfit.length_factor, segments, LENGTH, found.residuals),
+        capacitance_factor=_factor(
+            misfit.capacitance_factor, segments, CAPACITANCE, found.residuals
+        ),
         length_worst_m=std_m * worst_of(lengths),
         capacitance_worst_f=std_f * worst_of(capacitances),
         widening=widening,
@@ -309,6 +313,15 @@ def result_of(
         rejected_laws=_each_once([*rejected, *find_simpler_laws(found, values)]),
         chi_squared_ratio=float(np.mean(found.residuals**2)),
     )
+
+
+def _factor(assumed: float, segments: Sequence[Segment], channel: str, residuals: Floats) -> float:
+    """True over stated standard deviation of the noise; 1 where no record states it."""
+    stated = [part for part in segments if not part.std_estimated]
+    noise = noise_of(channel_of(stated, channel, residuals))
+    if np.isfinite(noise):
+        return assumed * noise
+    return 1.0 if channel_of(segments, channel, residuals) else float("nan")
 
 
 def _unseen(unknowns: Unknowns, std: Floats) -> NDArray[np.bool_]:

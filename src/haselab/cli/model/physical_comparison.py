@@ -117,15 +117,19 @@ def _joined(found: Sequence[MotionPrediction], names: Sequence[str]) -> MotionPr
     if len(found) == 1:
         return found[0]
     parts: list[PredictedPart] = []
+    shapes: list[PredictedPart] = []
     for one, name in zip(found, names, strict=True):
-        parts += [
-            part
-            if part.experiment == name
-            else replace(part, experiment=f"{name}:{part.experiment}")
-            for part in one.parts
-        ]
+        parts += _named(one.parts, name)
+        shapes += _named(one.shapes, name)
     undetermined = dict.fromkeys(name for one in found for name in one.undetermined)
-    return MotionPrediction(tuple(parts), undetermined=tuple(undetermined))
+    return MotionPrediction(tuple(parts), undetermined=tuple(undetermined), shapes=tuple(shapes))
+
+
+def _named(parts: Sequence[PredictedPart], file: str) -> list[PredictedPart]:
+    return [
+        part if part.experiment == file else replace(part, experiment=f"{file}:{part.experiment}")
+        for part in parts
+    ]
 
 
 def _noise(model: IdentifiedModel) -> dict[str, float]:

@@ -141,6 +141,26 @@ def test_intervals_allow_for_the_gain_or_mass_that_the_capacitances_contradict(
 
 
 @pytest.mark.long
+def test_a_wrong_side_of_a_stack_gives_an_impossible_inertia_and_a_note(actuator, tmp_path, capsys):
+    """50 layers of 0.7 mm with a side of 35 mm instead of 25 mm seem 7 g heavier."""
+    actuator.write_text(
+        actuator.read_text() + "[actuator.parameters]\nactuator.side_m = 0.035\n"
+        "actuator.shear_modulus_pa = 18e3\nactuator.permittivity = 3.3\n"
+    )
+    files = [table(tmp_path / f"{m}.csv", m, seed=k) for k, m in enumerate((0.1, 0.3))]
+    masses = "--mass-kg", "0.1", "--mass-kg", "0.3"
+    code, text, _ = run(capsys, *files, "--actuator", actuator, *COLUMNS, *masses, "--json")
+    answer = json.loads(text)
+    assert code == 0
+    # a third of the own mass of 1,000 kg/m3 moves with the end
+    missing_kg = 1000.0 * 50 * 7e-4 * (0.035**2 - 0.025**2) / 3.0
+    found = answer["parameters"]["load.added_inertia_kg"]
+    assert found["value"] == pytest.approx(-missing_kg, abs=4.0 * found["std"])
+    assert any("standard deviations below 0, but no inertia is negative" in note
+               for note in answer["notes"])  # fmt: skip
+
+
+@pytest.mark.long
 def test_intervals_allow_for_a_wrong_zero_of_a_displacement_sensor(actuator, tmp_path, capsys):
     file = table(tmp_path / "a.csv", 0.3, shift_m=20e-6)
     code, text, _ = run(capsys, file, "--actuator", actuator, *COLUMNS, "--json")

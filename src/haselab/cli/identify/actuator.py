@@ -36,6 +36,7 @@ __all__ = ["actuator", "law_of_section", "section_of_fit"]
 
 _SAME = 1e-3  # largest relative difference of stated numbers that count as equal
 _TABLE_ZERO_M = 5e-5  # standard deviation of the zero of a displacement sensor, set by a caliper
+_TABLE_CLOCK = 1e-3  # relative standard deviation of their times: 30 frames/s are often 29.97
 
 
 @click.command("actuator")
@@ -125,6 +126,7 @@ def actuator(
     fit = fit_actuator(
         law, records, mass_kg=mass_kg,
         camera_bias_m=zero_std_m or (TRACKED_ZERO_M if tracked else _TABLE_ZERO_M),
+        clock_std=0.0 if tracked else _TABLE_CLOCK,
     )  # fmt: skip
     if not fit.succeeded:
         emit_fit(fit, inputs, as_json, out)

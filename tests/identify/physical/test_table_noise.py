@@ -7,6 +7,7 @@ import pytest
 
 from haselab.actuators import GRAVITY_M_S2, Drive, PlanarHasel, SampledLaw
 from haselab.identify.physical import ChannelNoise, IdentifiedModel, fit_actuator, predict_motion
+from haselab.identify.physical.plausible import find_implausible
 from haselab.identify.physical.unknowns import Unknowns
 from haselab.pipelines.motion_table import motion_of_table
 
@@ -66,6 +67,22 @@ def test_the_factor_of_a_fit_does_not_change_the_noise_that_another_record_estim
                    for one in (table, stated))  # fmt: skip
     assert np.allclose(part.std, LENGTH_STD_M, rtol=1e-3)
     assert np.allclose(other.std, 0.4 * table.length_std_m, rtol=1e-3)
+
+
+@pytest.mark.parametrize("seed", range(3))
+def test_an_actuator_that_moves_in_each_row_is_not_called_still(seed):
+    """At 20 Hz with voltages held for 3 rows, differences of all orders contain the motion."""
+    moving = recorded(seed, rows=90, hold=3, step_s=0.05)
+    assert moving.length_std_m[0] > 100.0 * LENGTH_STD_M
+    assert find_implausible(LAW, [moving]) == ""
+    rng = np.random.default_rng(seed)
+    still = replace(
+        moving, length_m=0.09 + LENGTH_STD_M * rng.standard_normal(90),
+        length_std_m=np.full(90, LENGTH_STD_M),
+        capacitance_f=1e-10 + CAPACITANCE_STD_F * rng.standard_normal(90),
+        capacitance_std_f=np.full(90, CAPACITANCE_STD_F),
+    )  # fmt: skip
+    assert "the actuator does not move" in find_implausible(LAW, [still])
 
 
 @pytest.mark.slow

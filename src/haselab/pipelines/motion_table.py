@@ -38,7 +38,7 @@ def motion_of_table(
 
     Args:
         name: for messages; the one experiment is called so, too.
-        time_s: of the rows, rising. Shape `(N,)`.
+        time_s: of the rows, rising; the motion begins at 0 s. Shape `(N,)`.
         voltage_v: of the actuator. Shape `(N,)`.
         mass_kg: that hangs.
         length_m: measured, NaN where it was not; None: nowhere. Shape `(N,)`.
@@ -55,6 +55,7 @@ def motion_of_table(
             f"{name} has {time_s.size} rows. It needs at least 2 rows whose times rise. "
             "Sort the rows by time, and remove repeated times."
         )
+    time_s = time_s - time_s[0]  # of Unix times, few digits would be left for the motion
     step_s = np.diff(time_s, append=2.0 * time_s[-1] - time_s[-2])
     no, none = np.zeros(0), np.zeros(0, dtype=np.int64)
     starts_s, volt, sensed, later_s, seen_s = time_s, voltage_v, none, no, no

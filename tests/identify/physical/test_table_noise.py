@@ -57,6 +57,18 @@ def test_the_noise_is_at_least_that_of_the_steps_of_the_values():
     assert found.length_std_m[0] >= 0.999 * 2e-5 / np.sqrt(12.0)
 
 
+def test_unix_times_are_times_since_the_first_row():
+    time_s, volt, length_m, capacitance_f = moved(1, rows=300)
+    one, other = (
+        motion_of_table("a", time_s + first_s, volt, mass_kg=MASS_KG, length_m=length_m,
+                        capacitance_f=capacitance_f)
+        for first_s in (0.0, 1.7e9)
+    )  # fmt: skip
+    # the last digit of a double of 1.7e9 is 2.4e-7
+    assert np.allclose(one.drive.edge_s, other.drive.edge_s, rtol=0.0, atol=1e-6)
+    assert np.allclose(one.length_time_s, other.length_time_s, rtol=0.0, atol=1e-6)
+
+
 def test_the_factor_of_a_fit_does_not_change_the_noise_that_another_record_estimates():
     unknowns = Unknowns.of(LAW, added_inertia_kg=0.0, mass_kg=MASS_KG)
     model = IdentifiedModel(unknowns, 1e-20 * np.eye(unknowns.values.size),

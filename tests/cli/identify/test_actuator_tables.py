@@ -268,6 +268,16 @@ def test_an_actuator_that_does_not_move_gives_no_numbers(actuator, tmp_path, cap
         assert code == 3 and "the actuator does not move" in error, error
 
 
+def test_a_kind_that_was_assumed_is_named_if_the_record_contradicts_it(tmp_path, capsys):
+    file = table(tmp_path / "a.csv", 0.3, rows=300)
+    path = tmp_path / "A.toml"
+    for kind, assumed in (("", True), ("kind = 'planar-hasel'\n", False)):
+        path.write_text(f"[actuator]\nmass_kg = 0.3\n{kind}[drive]\ngain_v_per_v = {GAIN}\n")
+        code, _, error = run(capsys, file, "--actuator", path, *COLUMNS, "--json")
+        assert code == 3, error
+        assert ("states no kind, so planar-hasel was assumed" in error) is assumed, error
+
+
 def test_a_load_without_equilibrium_is_named(actuator, tmp_path, capsys):
     file = table(tmp_path / "a.csv", 0.3, rows=300)
     code, _, error = run(capsys, file, "--actuator", actuator, *COLUMNS, "--mass-kg", "100")

@@ -48,7 +48,7 @@ _TABLE_CLOCK = 1e-3  # relative standard deviation of their times: 30 frames/s a
 @shared_option("--output", "outputs", multiple=True,
                detail="Used for tables only. Give it twice for a length and a capacitance. "
                "Default: y, "
-               "length_m, strain or capacitance_f.")  # fmt: skip
+               "or length_m or strain, and capacitance_f.")  # fmt: skip
 @RATE
 @shared_option("--mass-kg", "masses_kg", type=REAL, multiple=True,
                detail="For tables, give it once for all, or once for each in their order. "
@@ -128,6 +128,9 @@ def actuator(
         camera_bias_m=zero_std_m or (TRACKED_ZERO_M if tracked else _TABLE_ZERO_M),
         clock_std=0.0 if tracked else _TABLE_CLOCK,
     )  # fmt: skip
+    if fit.status != "ok" and "kind" not in tables.actuator.model_fields_set:
+        doubt = f"[actuator] states no kind, so {fit.kind} was assumed. State kind if it is another"
+        fit = replace(fit, status=f"{fit.status}. {doubt}")
     if not fit.succeeded:
         emit_fit(fit, inputs, as_json, out)
     section = section_of_fit(fit, records, gains_v_per_v[0])

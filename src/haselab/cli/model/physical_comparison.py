@@ -78,15 +78,14 @@ def compare_physical(
     model, tables = read_physical_model(path)
     sources = sources_of_physical_model(path)
     found, used, noise = [], [], _noise(model)
+    table = replace(options.table, unused=frozenset({"m", "F"} - set(noise)))
     for file in files:
         session = file.is_dir() or is_session(file)
         if options.experiments and not session:
             raise InputError(
                 f"--experiment is for sessions, but this file is a table. Leave it out. {file}"
             )
-        record, _ = motion_of_file(
-            file, options.table, tables, unverified=options.unverified, std=noise
-        )
+        record, _ = motion_of_file(file, table, tables, unverified=options.unverified, std=noise)
         if not session:
             _check_noise(record, noise, file)
         if record.voltage_remark:

@@ -10,11 +10,14 @@ from numpy.typing import NDArray
 from haselab.actuators import GRAVITY_M_S2, Drive
 from haselab.base import InputError
 from haselab.identify.physical import MotionRecord
+from haselab.identify.training_output import grid_step
 
 __all__ = ["motion_of_table"]
 
 Floats = NDArray[np.float64]
 _GLIMPSE = 0.01  # of the time to the next row
+_ORDERS = range(2, 9)  # of differences, which suppress the motion and leave the noise
+_LEAST_VALUES = 20  # differences, whose median is then certain to a fifth
 
 
 def motion_of_table(
@@ -35,7 +38,7 @@ def motion_of_table(
 
     Args:
         name: for messages; the one experiment is called so, too.
-        time_s: of the rows, rising. Shape `(N,)`.
+        time_s: of the rows, rising; the motion begins at 0 s. Shape `(N,)`.
         voltage_v: of the actuator. Shape `(N,)`.
         mass_kg: that hangs.
         length_m: measured, NaN where it was not; None: nowhere. Shape `(N,)`.
@@ -52,6 +55,7 @@ def motion_of_table(
             f"{name} has {time_s.size} rows. It needs at least 2 rows whose times rise. "
             "Sort the rows by time, and remove repeated times."
         )
+    time_s = time_s - time_s[0]  # of Unix times, few digits would be left for the motion
     step_s = np.diff(time_s, append=2.0 * time_s[-1] - time_s[-2])
     no, none = np.zeros(0), np.zeros(0, dtype=np.int64)
     starts_s, volt, sensed, later_s, seen_s = time_s, voltage_v, none, no, no
@@ -78,15 +82,23 @@ def motion_of_table(
         name, drive, seen_s, length_m, length_std, 2 * sensed, np.arange(sensed.size),
         capacitance_f, capacitance_std, (name,), np.zeros(length_m.size, np.int64),
         np.zeros(sensed.size, np.int64), capacitance_later_s=later_s,
+        std_estimated=length_std_m is None and capacitance_std_f is None,
     )  # fmt: skip
 
 
 def _noise(name: str, values: Floats) -> float:
-    """Standard deviation of the noise, by second differences, most of which hold no motion."""
-    second = np.abs(np.diff(values, 2))
+    """Standard deviation of the noise, by the differences of the order that shows the least.
+
+    Low orders contain motion. Where the motion changes in each row, all orders contain it.
+    """
     steps = np.diff(np.unique(values))
     if steps.size == 0:
         raise InputError(f"{name}: all measured values are {values[0]:g}. Check the column.")
-    # the median of a normal variable's size is 0.674 of its deviation; a second difference has 6
-    noise = float(np.median(second)) / (0.674 * math.sqrt(6.0)) if second.size else 0.0
-    return max(noise, float(steps.min()) / math.sqrt(12.0))
+    # the median of a normal variable's size is 0.674 of its deviation
+    found = [
+        float(np.median(np.abs(np.diff(values, order)))) / math.sqrt(math.comb(2 * order, order))
+        for order in _ORDERS
+        if values.size >= (_LEAST_VALUES if order > _ORDERS[0] else 1) + order
+    ]
+    noise = min(found, default=0.0) / 0.674
+    return max(noise, max(float(steps.min()), grid_step(values)) / math.sqrt(12.0))

@@ -141,6 +141,26 @@ def test_intervals_allow_for_the_gain_or_mass_that_the_capacitances_contradict(
 
 
 @pytest.mark.long
+def test_a_wrong_side_of_a_stack_gives_an_impossible_inertia_and_a_note(actuator, tmp_path, capsys):
+    """50 layers of 0.7 mm with a side of 35 mm instead of 25 mm seem 7 g heavier."""
+    actuator.write_text(
+        actuator.read_text() + "[actuator.parameters]\nactuator.side_m = 0.035\n"
+        "actuator.shear_modulus_pa = 18e3\nactuator.permittivity = 3.3\n"
+    )
+    files = [table(tmp_path / f"{m}.csv", m, seed=k) for k, m in enumerate((0.1, 0.3))]
+    masses = "--mass-kg", "0.1", "--mass-kg", "0.3"
+    code, text, _ = run(capsys, *files, "--actuator", actuator, *COLUMNS, *masses, "--json")
+    answer = json.loads(text)
+    assert code == 0
+    # a third of the own mass of 1,000 kg/m3 moves with the end
+    missing_kg = 1000.0 * 50 * 7e-4 * (0.035**2 - 0.025**2) / 3.0
+    found = answer["parameters"]["load.added_inertia_kg"]
+    assert found["value"] == pytest.approx(-missing_kg, abs=4.0 * found["std"])
+    assert any("standard deviations below 0, but no inertia is negative" in note
+               for note in answer["notes"])  # fmt: skip
+
+
+@pytest.mark.long
 def test_intervals_allow_for_a_wrong_zero_of_a_displacement_sensor(actuator, tmp_path, capsys):
     file = table(tmp_path / "a.csv", 0.3, shift_m=20e-6)
     code, text, _ = run(capsys, file, "--actuator", actuator, *COLUMNS, "--json")
@@ -246,6 +266,16 @@ def test_an_actuator_that_does_not_move_gives_no_numbers(actuator, tmp_path, cap
         np.savetxt(file, rows, "%.12g", ";", header="Zeit (s);U (mV);length_m;C (pF)", comments="")
         code, _, error = run(capsys, file, "--actuator", actuator, *COLUMNS, "--json")
         assert code == 3 and "the actuator does not move" in error, error
+
+
+def test_a_kind_that_was_assumed_is_named_if_the_record_contradicts_it(tmp_path, capsys):
+    file = table(tmp_path / "a.csv", 0.3, rows=300)
+    path = tmp_path / "A.toml"
+    for kind, assumed in (("", True), ("kind = 'planar-hasel'\n", False)):
+        path.write_text(f"[actuator]\nmass_kg = 0.3\n{kind}[drive]\ngain_v_per_v = {GAIN}\n")
+        code, _, error = run(capsys, file, "--actuator", path, *COLUMNS, "--json")
+        assert code == 3, error
+        assert ("states no kind, so planar-hasel was assumed" in error) is assumed, error
 
 
 def test_a_load_without_equilibrium_is_named(actuator, tmp_path, capsys):

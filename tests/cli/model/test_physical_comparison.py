@@ -191,6 +191,54 @@ def test_a_table_is_predicted(actuator, tmp_path, capsys, unit):
     assert answer["fit_percent"] > 99.0 and answer["inside_band"] > 0.93
 
 
+def both_signals(path):
+    """A table of lengths and capacitances."""
+    length, farad = (np.loadtxt(table(path, unit=unit), delimiter=",", skiprows=1)
+                     for unit in ("m", "F"))  # fmt: skip
+    header = "time_s,voltage_v,length_m,capacitance_f"
+    rows = np.column_stack([length, farad[:, 2]])
+    np.savetxt(path, rows, "%.12g", ",", header=header, comments="")
+    return path
+
+
+def test_both_signals_of_a_table_are_compared(actuator, tmp_path, capsys):
+    file = both_signals(tmp_path / "new.csv")
+    named = "--output", "length_m", "--output", "capacitance_f"
+    for options, signals in (
+        ((), ["length", "capacitance"]), (named, ["length", "capacitance"]),
+        (named[2:], ["capacitance"]),
+    ):  # fmt: skip
+        code, text, error = run(capsys, "compare", actuator, file, *options, "--json")
+        assert code == 0, error
+        assert [one["signal"] for one in json.loads(text)["experiments"]] == signals
+    code, _, error = run(capsys, "compare", actuator, file, *named, "--model", "linear")
+    assert code == 2 and "--output is given 2 times, but a linear model has one output" in error
+    # a model of lengths alone says nothing of the noise of capacitances
+    text = actuator.read_text()
+    actuator.write_text("\n".join(line for line in text.splitlines()
+                                  if not line.startswith("capacitance_")))  # fmt: skip
+    code, text, error = run(capsys, "compare", actuator, file, "--json")
+    assert code == 0, error
+    assert [one["signal"] for one in json.loads(text)["experiments"]] == ["length"]
+    code, _, error = run(capsys, "compare", actuator, file, *named)
+    assert code == 2 and "does not state the noise of values in F" in error
+
+
+def test_a_folder_of_tables_and_a_time_that_is_nan_are_named(actuator, tmp_path, capsys):
+    folder = tmp_path / "tables"
+    folder.mkdir()
+    file = table(folder / "new.csv")
+    for options in ((), ("--input", "voltage_v")):
+        code, _, error = run(capsys, "compare", actuator, folder, *options)
+        assert code == 2 and "no session.h5, but 1 files such as new.csv" in error
+        assert "name each" in error and error.count("\n") == 1
+    lines = file.read_text().splitlines()
+    lines[6] = "nan," + lines[6].partition(",")[2]
+    file.write_text("\n".join(lines))
+    code, _, error = run(capsys, "compare", actuator, file)
+    assert code == 2 and "Column time_s has nan in row 6 (1 such rows)" in error
+
+
 def test_what_the_user_states_counts_before_the_file(actuator, tmp_path, capsys):
     file = table(tmp_path / "new.csv")
     assert run(capsys, "compare", actuator, file, "--mass-kg", "0.2")[0] == 0

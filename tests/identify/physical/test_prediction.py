@@ -213,3 +213,21 @@ def test_a_fit_predicts_another_record():
     assert found.status == "ok"
     for part in found.all_parts:
         assert 0.92 < part.inside_band < 0.99
+
+
+def test_an_uncertain_zero_does_not_hide_a_wrong_shape():
+    """The zero of a caliper, 50 um, is an error of all lengths together, not of each."""
+    matrix, at = MATRIX.copy(), NAMES.index(CAMERA_OFFSET)
+    matrix[at], matrix[:, at], matrix[at, at] = 0.0, 0.0, 5e-5**2
+    uncertain = model(matrix=matrix)
+    record = seen(TRUE, 11)
+    rest_m = record.length_m[0]
+    stretched = replace(record, length_m=rest_m + 1.005 * (record.length_m - rest_m))
+    moved = replace(record, length_m=record.length_m + 5e-5)
+    right, wrong, shifted = (predict_motion(uncertain, one) for one in (record, stretched, moved))
+    assert right.status == "ok" and shifted.status == "ok"
+    assert right.together(LENGTH).std.min() > 5e-5
+    assert not any(part.is_outside for part in wrong.all_parts)
+    assert wrong.status.startswith("model error: without a constant, only ")
+    # a moved camera is another constant
+    assert predict_motion(uncertain, moved, free_offset=True).status == "ok"

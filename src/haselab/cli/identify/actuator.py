@@ -36,6 +36,7 @@ __all__ = ["actuator", "law_of_section", "section_of_fit"]
 
 _SAME = 1e-3  # largest relative difference of stated numbers that count as equal
 _TABLE_ZERO_M = 5e-5  # standard deviation of the zero of a displacement sensor, set by a caliper
+_TABLE_CLOCK = 1e-3  # relative standard deviation of their times: 30 frames/s are often 29.97
 
 
 @click.command("actuator")
@@ -47,7 +48,7 @@ _TABLE_ZERO_M = 5e-5  # standard deviation of the zero of a displacement sensor,
 @shared_option("--output", "outputs", multiple=True,
                detail="Used for tables only. Give it twice for a length and a capacitance. "
                "Default: y, "
-               "length_m, strain or capacitance_f.")  # fmt: skip
+               "or length_m or strain, and capacitance_f.")  # fmt: skip
 @RATE
 @shared_option("--mass-kg", "masses_kg", type=REAL, multiple=True,
                detail="For tables, give it once for all, or once for each in their order. "
@@ -105,6 +106,7 @@ def actuator(
             file, replace(options, mass_kg=mass_kg), tables, unverified=unverified, std=std
         )
         if not (file.is_dir() or is_session(file)):
+            record = replace(record, std_estimated=True)
             for unit, stds in (("m", record.length_std_m), ("F", record.capacitance_std_f)):
                 std |= {unit: float(stds[0])} if stds.size else {}
         records.append(record)
@@ -124,7 +126,11 @@ def actuator(
     fit = fit_actuator(
         law, records, mass_kg=mass_kg,
         camera_bias_m=zero_std_m or (TRACKED_ZERO_M if tracked else _TABLE_ZERO_M),
+        clock_std=0.0 if tracked else _TABLE_CLOCK,
     )  # fmt: skip
+    if fit.status != "ok" and "kind" not in tables.actuator.model_fields_set:
+        doubt = f"[actuator] states no kind, so {fit.kind} was assumed. State kind if it is another"
+        fit = replace(fit, status=f"{fit.status}. {doubt}")
     if not fit.succeeded:
         emit_fit(fit, inputs, as_json, out)
     section = section_of_fit(fit, records, gains_v_per_v[0])

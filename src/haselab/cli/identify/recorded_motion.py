@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Collection, Mapping
 from dataclasses import dataclass, replace
 from pathlib import Path
 
@@ -20,6 +20,7 @@ from haselab.pipelines.motion import motion_of_session
 from haselab.pipelines.motion_table import motion_of_table
 from haselab.pipelines.time_axis import check_rising
 from haselab.rig.protocols import PLANAR_HASEL
+from haselab.store.columns.reader import open_archive
 from haselab.store.columns.selection import ColumnOptions
 from haselab.store.columns.table import Table
 from haselab.store.session.opening import is_session
@@ -29,9 +30,8 @@ __all__ = ["TableOptions", "motion_of_file"]
 
 Floats = NDArray[np.float64]
 _VOLTAGE = Quantity("--input", ("u", "voltage_v", "voltage"), "V", "the voltage")
-_MEASURED = Quantity(
-    "--output", ("y", "length_m", "strain", "capacitance_f"), None, "what was measured"
-)
+_LENGTHS, _CAPACITANCE = ("y", "length_m", "strain"), "capacitance_f"
+_TABLES = (".csv", ".txt", ".mat", ".npz", ".npy", ".tdms", ".xlsx")
 _GAP = 1.5  # usual steps, from which rows may be missing
 _ENDINGS = {"strain": "1", "_m": "m", "_f": "F"}
 
@@ -42,12 +42,13 @@ class TableOptions:
 
     Args:
         source: column of the voltage; None: by its name.
-        outputs: columns of what was measured; none: by its name.
+        outputs: columns of what was measured; none: by their names.
         rate_hz: sampling rate; None: that of the file.
         mass_kg: hung mass; None: that of the actuator file.
         gain_v_per_v: of the amplifier; None: that of the actuator file.
         zero_length_m: length at zero strain; None: that of the actuator file.
         columns: what the user states about the columns.
+        unused: units, m or F, of columns that are used only if `outputs` names them.
     """
 
     source: str | None
@@ -57,6 +58,7 @@ class TableOptions:
     gain_v_per_v: float | None
     zero_length_m: float | None
     columns: ColumnOptions
+    unused: frozenset[str] = frozenset()
 
     def refuse_for_session(self, file: Path) -> None:
         """Refuse these options for a session.
@@ -101,6 +103,7 @@ def motion_of_file(
     Raises:
         InputError: not readable, or something that the motion needs is not known.
     """
+    _refuse_folder_of_tables(file)
     if file.is_dir() or is_session(file):
         options.refuse_for_session(file)
         with SessionReader(file, unverified=unverified) as reader:
@@ -112,6 +115,17 @@ def motion_of_file(
             # all sessions have the same file name, so messages quote the path that the user typed
             return replace(motion, name=str(file)), gain_v_per_v
     return _table(file, options, known, std or {})
+
+
+def _refuse_folder_of_tables(folder: Path) -> None:
+    if not folder.is_dir() or session_file(folder).exists():
+        return
+    tables = sorted(path.name for path in folder.iterdir() if path.suffix.lower() in _TABLES)
+    if tables:
+        raise InputError(
+            f"This folder has no session.h5, but {len(tables)} files such as {tables[0]}. If they "
+            f"are tables, name each: {folder / tables[0]}"
+        )
 
 
 def _warn_of_kind(recorded: str, stated: str, file: Path) -> None:
@@ -127,7 +141,7 @@ def _table(
     file: Path, options: TableOptions, known: ActuatorTables, std: Mapping[str, float]
 ) -> tuple[MotionRecord, float]:
     source = _VOLTAGE.column(file, options.source)
-    outputs = [_MEASURED.column(file, name) for name in options.outputs or (None,)]
+    outputs = list(options.outputs) or _usual_outputs(file, options.unused)
     table = read_valid(file, (source, *outputs), options.columns, may_lack=outputs)
     stated = table.units[source]
     if stated is not None and stated.si != "V":
@@ -172,6 +186,18 @@ def _table(
         length_std_m=std.get("m"), capacitance_std_f=std.get("F"),
     )  # fmt: skip
     return record, gain_v_per_v
+
+
+def _usual_outputs(file: Path, unused: Collection[str]) -> list[str]:
+    """The column of the lengths and that of the capacitances, as far as a file has them."""
+    with open_archive(file) as archive:
+        found = [name for name in (*_LENGTHS, _CAPACITANCE) if archive.locate(name) is not None]
+    length = next((name for name in found if name in _LENGTHS), None)
+    if length is None or length == _LENGTHS[0]:  # y can be either
+        return found[:1] or [_LENGTHS[0]]
+    both = [length, *found[-1:]] if found[-1] == _CAPACITANCE else [length]
+    wanted = [name for name in both if ("F" if name == _CAPACITANCE else "m") not in unused]
+    return wanted or both[:1]
 
 
 def _warn_of_gaps(time_s: Floats, file: Path) -> None:

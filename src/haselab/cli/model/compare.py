@@ -63,7 +63,9 @@ _NO_NOISE = (
 )
 @shared_option(
     "--output",
-    default="y",
+    "outputs",
+    multiple=True,
+    detail="With a physical model, give it twice for a length and a capacitance.",
     show_default="y; with a physical model the columns of length, strain, capacitance",
 )
 @RATE
@@ -103,7 +105,7 @@ def command(
     model: Path,
     files: tuple[Path, ...],
     source: str,
-    output: str,
+    outputs: tuple[str, ...],
     rate_hz: float | None,
     at_rest: bool,
     through_voltage_map: bool,
@@ -144,9 +146,8 @@ def command(
     """
     linear = at_rest or through_voltage_map or held_at_hz is not None
     linear |= hold is not None
-    measured = _given(context, "output", output)
     table = TableOptions(
-        _given(context, "source", source), () if measured is None else (measured,), rate_hz,
+        _given(context, "source", source), outputs, rate_hz,
         mass_kg, gain_v_per_v, zero_length_m, columns,
     )  # fmt: skip
     options = PhysicalOptions(experiments, free_offset, longest_m, unverified, table)
@@ -159,6 +160,12 @@ def command(
         compare_physical(model, files, options, as_json=as_json, out=out, plot=plot)
         return
     refuse_for_linear(options)
+    if len(outputs) > 1:
+        raise InputError(
+            f"--output is given {len(outputs)} times, but a linear model has one output. Give it "
+            "once."
+        )
+    output = outputs[0] if outputs else "y"
     warn_misspelled_in(model)
     plant, posterior, origin = read_any_plant(model), read_posterior(model), read_origin(model)
     noise_std = origin.residual_std

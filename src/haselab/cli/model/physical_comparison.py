@@ -78,15 +78,14 @@ def compare_physical(
     model, tables = read_physical_model(path)
     sources = sources_of_physical_model(path)
     found, used, noise = [], [], _noise(model)
+    table = replace(options.table, unused=frozenset({"m", "F"} - set(noise)))
     for file in files:
         session = file.is_dir() or is_session(file)
         if options.experiments and not session:
             raise InputError(
                 f"--experiment is for sessions, but this file is a table. Leave it out. {file}"
             )
-        record, _ = motion_of_file(
-            file, options.table, tables, unverified=options.unverified, std=noise
-        )
+        record, _ = motion_of_file(file, table, tables, unverified=options.unverified, std=noise)
         if not session:
             _check_noise(record, noise, file)
         if record.voltage_remark:
@@ -117,15 +116,19 @@ def _joined(found: Sequence[MotionPrediction], names: Sequence[str]) -> MotionPr
     if len(found) == 1:
         return found[0]
     parts: list[PredictedPart] = []
+    shapes: list[PredictedPart] = []
     for one, name in zip(found, names, strict=True):
-        parts += [
-            part
-            if part.experiment == name
-            else replace(part, experiment=f"{name}:{part.experiment}")
-            for part in one.parts
-        ]
+        parts += _named(one.parts, name)
+        shapes += _named(one.shapes, name)
     undetermined = dict.fromkeys(name for one in found for name in one.undetermined)
-    return MotionPrediction(tuple(parts), undetermined=tuple(undetermined))
+    return MotionPrediction(tuple(parts), undetermined=tuple(undetermined), shapes=tuple(shapes))
+
+
+def _named(parts: Sequence[PredictedPart], file: str) -> list[PredictedPart]:
+    return [
+        part if part.experiment == file else replace(part, experiment=f"{file}:{part.experiment}")
+        for part in parts
+    ]
 
 
 def _noise(model: IdentifiedModel) -> dict[str, float]:

@@ -67,6 +67,7 @@ def fit_actuator(
     added_inertia_kg: float | None = None,
     camera_bias_m: float = TRACKED_ZERO_M,
     camera_scale_std: float = 5e-5,
+    clock_std: float = 0.0,
 ) -> ActuatorFit:
     """Identify a physical model from records.
 
@@ -79,6 +80,7 @@ def fit_actuator(
             one that those of each of several records share; a track of 0.02 px is usual.
         camera_scale_std: relative standard deviation of the camera's scale, with the slow
             errors of tracking over the picture.
+        clock_std: relative standard deviation of the stated times.
     Returns:
         The model, with the covariance of its parameters.
     Raises:
@@ -92,7 +94,10 @@ def fit_actuator(
         added_inertia_kg = _USUAL_INERTIA * mass_kg
     start = Unknowns.of(law, added_inertia_kg=added_inertia_kg, mass_kg=mass_kg)
     known = {CAMERA_OFFSET: camera_bias_m, CAMERA_SCALE: camera_scale_std}
-    fit = _fit(law, records, start, known)
+    fit = _fit(law, records, start, known, clock_std)
+    if not fit.succeeded:
+        for remark in (remark for record in records for remark in record.repeated_remarks):
+            fit = replace(fit, status=f"{fit.status}. {remark}. Record with finer steps")
     if moving := motion_before_drive(records):
         if fit.succeeded:
             return replace(fit, notes=(*fit.notes, f"{moving}."))
@@ -101,7 +106,11 @@ def fit_actuator(
 
 
 def _fit(
-    law: ActuatorLaw, records: Sequence[MotionRecord], start: Unknowns, known: Mapping[str, float]
+    law: ActuatorLaw,
+    records: Sequence[MotionRecord],
+    start: Unknowns,
+    known: Mapping[str, float],
+    clock: float,
 ) -> ActuatorFit:
     """Identify a model from plausible records.
 
@@ -110,6 +119,7 @@ def _fit(
         records: of one actuator.
         start: where the search begins.
         known: standard deviations of what is known of the camera beforehand.
+        clock: relative standard deviation of the stated times.
     """
     count = sum(record.length_m.size + record.capacitance_f.size for record in records)
     if count < _LEAST_VALUES * start.values.size:
@@ -162,7 +172,7 @@ def _fit(
     others = compare_elastic_laws(misfit, found) if certain else []
     rejected += [rival for rival in others if rival.log_evidence < 0.0]
     preferred = [rival for rival in others if rival.log_evidence > 0.0]
-    return result_of(misfit, _ordered(found), rejected, preferred, scaled)
+    return result_of(misfit, _ordered(found), rejected, preferred, scaled, clock=clock)
 
 
 def _first_acts(records: Sequence[MotionRecord]) -> str:

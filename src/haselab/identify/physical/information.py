@@ -26,6 +26,7 @@ __all__ = [
     "RELATIVE",
     "Source",
     "covariance_of",
+    "covariance_of_runs",
     "determined_by",
     "largest_std",
     "vague_information",
@@ -94,6 +95,31 @@ def covariance_of(factors: Sequence[Floats]) -> Floats:
     upper = np.linalg.qr(stacked / scale, mode="r")
     inverse = solve_triangular(upper, np.eye(scale.size)) / scale[:, None]
     return np.asarray(inverse @ inverse.T)
+
+
+def covariance_of_runs(jacobian: Floats, runs: NDArray[np.int64], prior: Floats) -> Floats:
+    r"""Covariance of estimates if all residuals of a run have the same error.
+
+    $A\left(\sum_g s_g^\top s_g + D\right)A$, with $A = (J^\top J + D)^{-1}$, the sum $s_g$ of the
+    derivatives over the run $g$, and the information $D$ before the records. Runs of one residual
+    each give $A$.
+
+    Args:
+        jacobian: of the residuals, whose variance is 1. Shape `(N, P)`.
+        runs: number of the run of each residual, from 0 on. Shape `(N,)`.
+        prior: information on what varies before the records. Positive, shape `(P,)`.
+    Returns:
+        Covariance. Shape `(P, P)`.
+    Example:
+        >>> prior = np.array([1e-12])
+        >>> covariance_of_runs(np.ones((4, 1)), np.array([0, 0, 1, 1]), prior).round(6).tolist()
+        [[0.5]]
+    """
+    before = np.diag(np.sqrt(prior))
+    summed = np.zeros((int(runs.max(initial=-1)) + 1, prior.size))
+    np.add.at(summed, runs, jacobian)
+    root = np.vstack([summed, before]) @ covariance_of([jacobian, before])
+    return np.asarray(root.T @ root)
 
 
 def determined_by(

@@ -15,7 +15,7 @@ from haselab import _motion
 from haselab.actuators import ADDED_INERTIA, Response, SampledLaw
 from haselab.actuators.threads import in_threads
 from haselab.base import HaselabError, LimitError
-from haselab.identify.physical.record import MotionRecord
+from haselab.identify.physical.record import MotionRecord, repeats
 from haselab.identify.physical.unknowns import (
     CAMERA_LATENCY,
     CAMERA_OFFSET,
@@ -268,11 +268,13 @@ class Segment:
         experiment: its name; empty for what is known beforehand.
         channel: `LENGTH`, `CAPACITANCE` or "known".
         rows: of the residuals.
+        std_estimated: see `MotionRecord`.
     """
 
     experiment: str
     channel: str
     rows: NDArray[np.int64]
+    std_estimated: bool = False
 
 
 @dataclass(frozen=True)
@@ -328,10 +330,28 @@ class Misfit:
                 for k, name in enumerate(record.experiments):
                     rows = at + np.flatnonzero(member == k)
                     if rows.size:
-                        found.append(Segment(name, channel, rows))
+                        found.append(Segment(name, channel, rows, record.std_estimated))
                 at += member.size
         known = np.arange(at, at + len(self.known))
         return [*found, Segment("", "known", known)] if known.size else found
+
+    @cached_property
+    def runs(self) -> NDArray[np.int64]:
+        """Number of the run of equal successive values that each residual belongs to. Shape `(N,)`.
+
+        The values of a run share the error of one step of a converter, or are one value that was
+        held. Where few values repeat, each is a run of its own.
+        """
+        found = [
+            _runs(values, member)
+            for record in self.records
+            for values, member in (
+                (record.length_m, record.length_experiment),
+                (record.capacitance_f, record.capacitance_experiment),
+            )
+        ]
+        begins = np.concatenate([*found, np.ones(len(self.known), dtype=bool)])
+        return np.cumsum(begins) - 1
 
     def residuals(self, unknowns: Unknowns) -> Floats | None:
         """Measured minus modelled over the standard deviation; None where no motion exists.
@@ -413,6 +433,13 @@ class Misfit:
             parts.append((record.capacitance_f - part.capacitance_f) / std_f)
         known = [(usual(name) - unknowns.value(name)) / std for name, std in self.known.items()]
         return np.concatenate([*parts, known])
+
+
+def _runs(values: Floats, member: NDArray[np.int64]) -> NDArray[np.bool_]:
+    """Which values begin a run of equal ones within an experiment. Shape `(N,)`."""
+    if not repeats(values):
+        return np.ones(values.size, dtype=bool)
+    return np.append(True, (np.diff(values) != 0.0) | (np.diff(member) != 0))
 
 
 def least_explained(misfit: Misfit, residuals: Floats) -> float:

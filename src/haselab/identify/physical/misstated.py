@@ -10,6 +10,9 @@ $\delta\theta = (J^\top J)^{-1} J^\top g\,a$
 where $a$ is the error that alone explains $s$. The largest of these moves counts as one standard
 deviation.
 
+The clock of the records has an error $a$ of which only the standard deviation is known beforehand.
+It moves the estimates in the same way, and the squares of these moves add to the variances.
+
 Lengths of a wrong scale may also leave residuals that an effect imitates which the law lacks.
 Before such an effect is added, the scale and the zero of the lengths are estimated from the
 records. With sums of squares $S$, the logarithm of evidence of $k$ effects over the wrong scale is
@@ -35,7 +38,14 @@ from haselab.identify.physical.rivals import DECISIVE
 from haselab.identify.physical.search import SearchResult, refine
 from haselab.identify.physical.unknowns import CAMERA_OFFSET, CAMERA_SCALE, SENSING_SCALE
 
-__all__ = ["WrongScale", "find_wrong_scale", "misstated_std", "scale_error", "suspect_scale"]
+__all__ = [
+    "WrongScale",
+    "clock_std",
+    "find_wrong_scale",
+    "misstated_std",
+    "scale_error",
+    "suspect_scale",
+]
 
 Floats = NDArray[np.float64]
 _CAREFUL = 0.005  # error of the capacitance that a careful calibration has
@@ -76,15 +86,49 @@ def misstated_std(misfit: Misfit, found: SearchResult, error: float, prior: Floa
     largest = np.zeros(unknowns.values.size)
     if error == 0.0:
         return largest
-    columns = np.vstack([found.jacobian, np.diag(np.sqrt(prior))])
-    size = np.linalg.norm(columns, axis=0)
     for change in _changes(misfit, found):
-        wanted = np.concatenate([change, np.zeros(size.size)])
-        moved = np.linalg.lstsq(columns / size, wanted, rcond=None)[0] / size
+        moved = _moved(found, change, prior)
         # a mass of one record may hardly change the scale
         share = min(abs(error), _MOST * abs(moved[scale])) / max(abs(moved[scale]), 1e-300)
         largest = np.maximum(largest, share * np.abs(moved))
     return largest
+
+
+def clock_std(misfit: Misfit, found: SearchResult, relative: float, prior: Floats) -> Floats:
+    """Standard deviations of what varies, for an error of the clock of all records.
+
+    Args:
+        misfit: that was minimised.
+        found: its minimum.
+        relative: standard deviation of the stated over the true times.
+        prior: information on what varies before the records. Positive, shape `(P,)`.
+    Returns:
+        Standard deviations. Shape `(P,)`.
+    """
+    slower = [_slower(record, 1.0 + _LITTLE) for record in misfit.records]
+    residuals = replace(misfit, records=slower).residuals(found.unknowns) if relative else None
+    if residuals is None:
+        return np.zeros(found.unknowns.values.size)
+    return relative * np.abs(_moved(found, (found.residuals - residuals) / _LITTLE, prior))
+
+
+def _moved(found: SearchResult, change: Floats, prior: Floats) -> Floats:
+    """By how much a change of the model's output moves what varies. Shape `(P,)`."""
+    columns = np.vstack([found.jacobian, np.diag(np.sqrt(prior))])
+    size = np.linalg.norm(columns, axis=0)
+    wanted = np.concatenate([change, np.zeros(size.size)])
+    return np.asarray(np.linalg.lstsq(columns / size, wanted, rcond=None)[0] / size)
+
+
+def _slower(record: MotionRecord, factor: float) -> MotionRecord:
+    """The record with all times multiplied by a factor."""
+    return replace(
+        record,
+        drive=replace(record.drive, edge_s=factor * record.drive.edge_s),
+        length_time_s=factor * record.length_time_s,
+        exposure_s=factor * record.exposure_s,
+        capacitance_later_s=factor * record.capacitance_later_s,
+    )
 
 
 def _changes(misfit: Misfit, found: SearchResult) -> Iterator[Floats]:

@@ -9,6 +9,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.special import fdtrc
 
 from haselab.actuators import ActuatorLaw, equilibrium_m
 from haselab.base import HaselabError, LimitError
@@ -40,6 +41,7 @@ _REVERSED = 0.25  # of the simulated difference of two lengths
 _LEAST_LENGTHS = 5  # of a load
 _MOVES = 1.5  # spread of all values over their noise; below, nothing moves
 _LEAST_STILL = 30  # values, whose spread is then certain to 13 %
+_LAGS, _BY_CHANCE = (0, 1, 2, 4, 6), 1e-6  # intervals of the drive; probability without motion
 _BEFORE, _SHARE_BEFORE = 5.0, 0.1  # spread before the drive changes, over noise; of the whole range
 _DECIDES = 0.5  # simulated difference over that at rest; above, creep does not reverse it
 
@@ -112,7 +114,7 @@ def _still(records: Sequence[MotionRecord]) -> str:
         joined = np.concatenate(values)
         if joined.size >= _LEAST_STILL:
             spreads.append(float(np.std(joined) / np.median(np.concatenate(stds))))
-    if not spreads or max(spreads) > _MOVES:
+    if not spreads or max(spreads) > _MOVES or any(map(_follows_voltage, records)):
         return ""
     highest_v = max(float(np.abs(record.drive.voltage_v).max()) for record in records)
     return (
@@ -120,6 +122,32 @@ def _still(records: Sequence[MotionRecord]) -> str:
         f"noise, at voltages up to {highest_v:.3g} V. Record a voltage that changes and moves it, "
         "or check the voltage column and the amplifier's gain"
     )
+
+
+def _follows_voltage(record: MotionRecord) -> bool:
+    """Whether values whose noise is only an estimate depend on the voltages before them.
+
+    If the voltage changes in almost every row, the estimate contains the motion.
+    """
+    square_v2 = record.drive.voltage_v**2
+    if not record.std_estimated or not np.ptp(square_v2) > 0.0:
+        return False
+    first = np.unique(record.window_of, return_index=True)[1]
+    for values, at in (
+        (record.length_m, _interval(record)), (record.capacitance_f, record.window[first])
+    ):  # fmt: skip
+        degrees = values.size - len(_LAGS) - 1
+        if degrees < _LEAST_LENGTHS:
+            continue
+        past = [square_v2[np.maximum(at - lag, 0)] / square_v2.max() for lag in _LAGS]
+        columns = np.column_stack([np.ones(values.size), *past])
+        centred = (values - values.mean()) / np.std(values)
+        left = centred - columns @ np.linalg.lstsq(columns, centred, rcond=None)[0]
+        unexplained = float(left @ left)
+        ratio = (values.size - unexplained) / len(_LAGS) / max(unexplained / degrees, 1e-300)
+        if float(fdtrc(len(_LAGS), degrees, ratio)) < _BY_CHANCE:
+            return True
+    return False
 
 
 def _length(law: ActuatorLaw, record: MotionRecord) -> str:

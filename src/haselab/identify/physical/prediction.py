@@ -68,6 +68,19 @@ class ChannelNoise:
         excess = 0.0 if self.explained else self.worst**2 - self.noise**2
         return float(np.sqrt(excess)) if excess > 0.0 else 0.0
 
+    def std_of(self, stated: Floats, estimated: bool) -> Floats:
+        """Standard deviations of the noise of another record.
+
+        Args:
+            stated: of its values, in the unit of the channel. Shape `(N,)`.
+            estimated: whether they are estimates from the values, see `MotionRecord`.
+        Returns:
+            Shape `(N,)`; where they are estimates, the noise of the fit if it is known.
+        """
+        if not estimated:
+            return self.factor * stated
+        return np.full(stated.size, self.noise) if np.isfinite(self.noise) else stated
+
 
 @dataclass(frozen=True)
 class IdentifiedModel:
@@ -244,11 +257,14 @@ class MotionPrediction:
         parts: of all experiments, first all lengths, then all capacitances.
         offset_m: constant that was added to the predicted lengths, if it was free.
         undetermined: parameters without a standard deviation that matter here.
+        shapes: the lengths of `parts` again, without the constant by which all of the record
+            differ; none if it was free.
     """
 
     parts: tuple[PredictedPart, ...]
     offset_m: float = 0.0
     undetermined: tuple[str, ...] = ()
+    shapes: tuple[PredictedPart, ...] = ()
 
     def together(self, channel: str) -> PredictedPart | None:
         """All experiments of a channel; None where it was not recorded.
@@ -291,13 +307,27 @@ class MotionPrediction:
         whole = [part for part in self.all_parts if part.is_outside]
         worst = min(self.outside or whole, key=lambda part: part.inside_band, default=None)
         if worst is None:
-            return "ok"
+            return self._shape_status
         where = f" of {worst.experiment}" if worst.experiment else ""
         return (
             f"model error: only {100.0 * worst.inside_band:.0f} % of the {worst.channel} values"
             f"{where} are inside the 95 % band ({len(self.outside)} of {len(self.parts)} "
             "experiments and channels have a larger error than it explains). Identify the actuator "
             "from records of such drives and loads too"
+        )
+
+    @property
+    def _shape_status(self) -> str:
+        """ "ok", or that the lengths have another shape, which an uncertain zero would hide."""
+        outside = [part for part in self.shapes if part.is_outside]
+        if not outside:
+            return "ok"
+        worst = min(outside, key=lambda part: part.inside_band)
+        return (
+            f"model error: without a constant, only {100.0 * worst.inside_band:.0f} % of the "
+            f"length values of {worst.experiment} are inside their 95 % band, which is then "
+            f"±{1e6 * Z95 * float(np.median(worst.std)):.2g} um. The wider band of all lengths is "
+            "that of their zero. Identify the actuator from records of such drives and loads too"
         )
 
     def chart(self, title: str) -> Chart:
@@ -378,24 +408,31 @@ def predict_motion(
     def std_of(by: Floats) -> Floats:
         return np.asarray(np.sqrt(np.maximum(((by @ spread) * by).sum(axis=1), 0.0)))
 
-    pixel_m = SHARED_PX * record.pixel_m
-    noise_m = np.hypot(model.length.factor * record.length_std_m, pixel_m)
+    estimated = record.std_estimated
+    noise_m = np.hypot(
+        model.length.std_of(record.length_std_m, estimated), SHARED_PX * record.pixel_m
+    )
     noise_m = np.hypot(noise_m, model.length.model_error)
     noise_f = np.hypot(
-        model.capacitance.factor * record.capacitance_std_f, model.capacitance.model_error
+        model.capacitance.std_of(record.capacitance_std_f, estimated),
+        model.capacitance.model_error,
     )
     wanted = [k for k, name in enumerate(record.experiments)
               if not experiments or name in experiments]  # fmt: skip
     frames = np.isin(record.length_experiment, wanted)
-    length_by, offset_m = found.length_by, 0.0
-    zero_m = 0.0 if free_offset else TRACKED_ZERO_M
-    if free_offset and frames.any():
+    offset_m, length_by = 0.0, found.length_by
+    length_std = np.hypot(std_of(length_by[:, known]), TRACKED_ZERO_M)
+    # an error that all lengths share would hide one of their shape
+    shape_m, shape_std = found.length_m, length_std
+    if frames.any():
         weights = np.where(frames, noise_m**-2.0, 0.0)
         weights /= weights.sum()
-        offset_m = float(weights @ (record.length_m - found.length_m))
-        found = replace(found, length_m=found.length_m + offset_m)
-        length_by = length_by - weights @ length_by
-    length_std = np.hypot(std_of(length_by[:, known]), zero_m)
+        constant_m = float(weights @ (record.length_m - found.length_m))
+        shape_m, shape_by = found.length_m + constant_m, length_by - weights @ length_by
+        shape_std = std_of(shape_by[:, known])
+        if free_offset:
+            offset_m, length_by, length_std = constant_m, shape_by, shape_std
+            found = replace(found, length_m=shape_m)
     capacitance_std = std_of(found.capacitance_by[:, known])
     idle = np.flatnonzero(~known)
     effects = np.vstack([
@@ -413,17 +450,24 @@ def predict_motion(
         (CAPACITANCE, record.capacitance_experiment, record.over_windows(middle_s[record.sensed]),
          record.capacitance_f, found.capacitance_f, noise_f, capacitance_std),
     )  # fmt: skip
-    parts = []
+    parts, shapes = [], []
     for channel, member, time_s, measured, predicted, noise, std in channels:
         for k in wanted:
             at = np.flatnonzero(member == k)
-            if at.size:
-                parts.append(PredictedPart(
-                    record.experiments[k], channel, time_s[at], measured[at], predicted[at],
-                    np.hypot(noise[at], std[at]), std[at],
+            if not at.size:
+                continue
+            part = PredictedPart(
+                record.experiments[k], channel, time_s[at], measured[at], predicted[at],
+                np.hypot(noise[at], std[at]), std[at],
+            )  # fmt: skip
+            parts.append(part)
+            if channel == LENGTH and not free_offset:
+                shapes.append(replace(
+                    part, predicted=shape_m[at], std=np.hypot(noise[at], shape_std[at]),
+                    parameter_std=shape_std[at],
                 ))  # fmt: skip
     undetermined = [unknowns.names[k] for k, yes in zip(idle, matters, strict=True) if yes]
-    return MotionPrediction(tuple(parts), offset_m, tuple(undetermined))
+    return MotionPrediction(tuple(parts), offset_m, tuple(undetermined), tuple(shapes))
 
 
 def _check_names(record: MotionRecord, experiments: Collection[str]) -> None:

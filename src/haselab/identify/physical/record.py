@@ -12,12 +12,14 @@ from scipy.sparse import csr_array
 
 from haselab.actuators import Drive
 from haselab.base import InputError
+from haselab.identify.training_output import grid_step
 
-__all__ = ["MotionRecord"]
+__all__ = ["MotionRecord", "repeats"]
 
 Floats = NDArray[np.float64]
 Integers = NDArray[np.int64]
 _VOLTAGE_ERROR = 0.01  # of a carefully calibrated monitor and amplifier together
+_REPEATED = 0.05  # share of values that are equal to the one before, above which these share errors
 
 
 @dataclass(frozen=True)
@@ -46,6 +48,8 @@ class MotionRecord:
         window_weight: of a second of each interval in its capacitance, shape `(W,)`; empty: all
             weigh the same.
         voltage_ratio: voltage by the monitor over drive times gain; NaN if it was not measured.
+        std_estimated: whether the standard deviations are estimates from the values themselves,
+            and say nothing of those that another record states.
     Raises:
         InputError: Shapes do not fit together, a value is not finite, or a standard deviation is
             not positive.
@@ -69,6 +73,7 @@ class MotionRecord:
     block: Integers = field(default_factory=lambda: np.zeros(0, dtype=np.int64))
     window_weight: Floats = field(default_factory=lambda: np.zeros(0))
     voltage_ratio: float = math.nan
+    std_estimated: bool = False
 
     @cached_property
     def sensed(self) -> NDArray[np.bool_]:
@@ -86,6 +91,22 @@ class MotionRecord:
             f"{self.name}: the voltage by the monitor is {self.voltage_ratio:.4g} times drive "
             "times gain. Check the gain of the amplifier and the scale of its voltage monitor."
         )
+
+    @property
+    def repeated_remarks(self) -> list[str]:
+        """What coarse steps or held values do to the lengths and capacitances."""
+        found = []
+        for what, values, unit in (
+            ("lengths", self.length_m, "m"), ("capacitances", self.capacitance_f, "F")
+        ):  # fmt: skip
+            if repeats(values):
+                share, step = float(np.mean(np.diff(values) == 0.0)), grid_step(values)
+                steps = f", and all are in steps of {step:.3g} {unit}" if step > 0.0 else ""
+                found.append(
+                    f"{self.name}: {100.0 * share:.0f} % of the {what} are equal to the one "
+                    f"before{steps}: neighbouring values have the same error"
+                )
+        return found
 
     @cached_property
     def _shares(self) -> csr_array:
@@ -139,3 +160,17 @@ class MotionRecord:
                     f"{self.name}: the standard deviation of a {what} is "
                     f"{float(std.min()):g}. It must be above 0."
                 )
+
+
+def repeats(values: Floats) -> bool:
+    """Whether so many values are equal to the one before that their errors are not independent.
+
+    Args:
+        values: measured. Shape `(N,)`.
+    Returns:
+        True if the steps of a converter are larger than the noise, or if values were held.
+    Example:
+        >>> repeats(np.array([0.0, 0.0, 1.0, 1.0])), repeats(np.arange(4.0))
+        (True, False)
+    """
+    return values.size > 1 and float(np.mean(np.diff(values) == 0.0)) > _REPEATED

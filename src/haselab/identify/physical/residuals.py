@@ -33,6 +33,7 @@ _SLIGHT, _GROSS = 1.05, 10.0  # rms over noise: of a model error, and of a contr
 _SCALE = 0.2  # largest error of the capacitance that a calibration can have
 _LEAST_SHARE = 0.75  # of the variance of each channel that a model must explain
 _WHITE = 1e-3  # probability of the residuals under white noise
+_COLOURED = 1e-5  # the same, from which a note says it
 _ENOUGH = 20  # values of an experiment, for an rms of its own
 
 
@@ -166,11 +167,14 @@ def status_of(
     return "ok", True
 
 
-def notes_of(error: float, records: Sequence[MotionRecord]) -> tuple[str, ...]:
-    """Notes on what may be misstated, according to capacitances and voltage monitors.
+def notes_of(
+    error: float, seen: ChannelResiduals, records: Sequence[MotionRecord]
+) -> tuple[str, ...]:
+    """Notes on what may be misstated, according to capacitances, monitors and residuals.
 
     Args:
         error: see `scale_error`.
+        seen: residuals.
         records: that were fitted.
     """
     notes = [record.voltage_remark for record in records if record.voltage_remark]
@@ -180,6 +184,19 @@ def notes_of(error: float, records: Sequence[MotionRecord]) -> tuple[str, ...]:
             "are well calibrated, the amplifier's gain, a mass or the camera's scale is wrong, and "
             "so are permittivity and stiffness. Their intervals allow for it."
         )
+    coarse = [remark for record in records for remark in record.repeated_remarks]
+    notes += [f"{remark}. The intervals allow for it." for remark in coarse]
+    if seen.explained and not coarse:
+        notes += [
+            f"The residuals of the {what} are not white (p = {p:.2g}), although they are hardly "
+            "larger than the noise: the noise is coloured, or the model has a small error. The "
+            "intervals allow for coloured noise only."
+            for what, p in (
+                ("lengths", whiteness_p(seen.lengths)),
+                ("capacitances", whiteness_p(seen.capacitances)),
+            )
+            if p < _COLOURED
+        ]
     if not any(record.capacitance_f.size for record in records):
         notes.append(
             "Without capacitances, the fit cannot detect a wrong gain, mass or scale of the "

@@ -24,15 +24,22 @@ from haselab.identify.noise import coloured_covariance
 from haselab.identify.physical.information import (
     Source,
     covariance_of,
+    covariance_of_runs,
     determined_by,
     largest_std,
     vague_information,
 )
 from haselab.identify.physical.misfit import CAPACITANCE, LENGTH, Misfit, Segment
-from haselab.identify.physical.misstated import WrongScale, misstated_std, scale_error
+from haselab.identify.physical.misstated import (
+    WrongScale,
+    clock_std,
+    misstated_std,
+    scale_error,
+)
 from haselab.identify.physical.model_error import hidden_std, widen_std
 from haselab.identify.physical.record import MotionRecord
 from haselab.identify.physical.residuals import (
+    channel_of,
     channel_residuals,
     noise_of,
     notes_of,
@@ -78,7 +85,8 @@ class ActuatorFit(Fit):
         capacitance_rms_f: of those of the capacitances.
         length_noise_m: from differences of neighbours, which a slow misfit does not change.
         capacitance_noise_f: likewise.
-        length_factor: true over stated standard deviation of the noise of the lengths.
+        length_factor: true over stated standard deviation of the noise of the lengths; 1 if all
+            records are tables, which do not state it.
         capacitance_factor: the same of the capacitances.
         length_worst_m: rms of the residuals in the experiment that the model explains least.
         capacitance_worst_f: the same of the capacitances.
@@ -207,6 +215,8 @@ def result_of(
     rejected: Sequence[Rival],
     preferred: Sequence[Rival],
     scaled: WrongScale | None = None,
+    *,
+    clock: float = 0.0,
 ) -> ActuatorFit:
     """The fit of a minimum.
 
@@ -216,6 +226,7 @@ def result_of(
         rejected: laws that the records contradict.
         preferred: laws that the records prefer.
         scaled: lengths of a wrong scale, if the minimum is theirs.
+        clock: relative standard deviation of the stated times.
     Returns:
         Estimates, or the reason why there are none.
     """
@@ -226,6 +237,9 @@ def result_of(
     length_noise, capacitance_noise = noise_of(lengths), noise_of(capacitances)
     prior = vague_information(unknowns)
     covariance = _covariance(found, segments, prior)
+    if misfit.runs.size > misfit.runs.max() + 1:
+        in_runs = covariance_of_runs(found.jacobian, misfit.runs, prior)
+        covariance = widen_std(covariance, np.sqrt(np.diag(in_runs)))
     own_std = np.sqrt(np.diag(covariance))
     scale = unknowns.value(SENSING_SCALE)
     if scale_error(scale, float(own_std[unknowns.names.index(SENSING_SCALE)])) == 0.0:
@@ -241,7 +255,9 @@ def result_of(
         covariance = widen_std(covariance, hidden_std(found.jacobian, energy, prior))
     scale_std = float(np.sqrt(np.diag(covariance))[unknowns.names.index(SENSING_SCALE)])
     error = scale_error(unknowns.value(SENSING_SCALE), scale_std)
-    covariance = widen_std(covariance, misstated_std(misfit, found, error, prior))
+    timed_std = np.hypot(np.sqrt(np.diag(covariance)), clock_std(misfit, found, clock, prior))
+    misstated = misstated_std(misfit, found, error, prior)
+    covariance = widen_std(covariance, np.maximum(timed_std, misstated))
     std = np.sqrt(np.diag(covariance))
     widening = np.divide(std, own_std, where=np.isfinite(own_std), out=np.ones(std.size))
     described = {about.key: about for about in unknowns.law.described()}
@@ -279,7 +295,7 @@ def result_of(
     values = covariance * np.outer(slopes, slopes)
     return ActuatorFit(
         status=status,
-        notes=notes_of(error, misfit.records),
+        notes=(*notes_of(error, seen, misfit.records), *_inertia_note(unknowns, std)),
         parameters=parameters,
         covariance=values,
         residuals=tuple(found.residuals[part.rows] for part in segments if part.experiment),
@@ -288,8 +304,10 @@ def result_of(
         length_noise_m=std_m * length_noise,
         capacitance_rms_f=std_f * rms_of(capacitances),
         capacitance_noise_f=std_f * capacitance_noise,
-        length_factor=misfit.length_factor * length_noise,
-        capacitance_factor=misfit.capacitance_factor * capacitance_noise,
+        length_factor=_factor(misfit.length_factor, segments, LENGTH, found.residuals),
+        capacitance_factor=_factor(
+            misfit.capacitance_factor, segments, CAPACITANCE, found.residuals
+        ),
         length_worst_m=std_m * worst_of(lengths),
         capacitance_worst_f=std_f * worst_of(capacitances),
         widening=widening,
@@ -309,6 +327,30 @@ def result_of(
         rejected_laws=_each_once([*rejected, *find_simpler_laws(found, values)]),
         chi_squared_ratio=float(np.mean(found.residuals**2)),
     )
+
+
+def _inertia_note(unknowns: Unknowns, std: Floats) -> tuple[str, ...]:
+    """A note if the inertia without weight is below 0, which no bench has."""
+    at = unknowns.names.index(ADDED_INERTIA)
+    added_kg = float(unknowns.values[at])
+    own_std_kg = float(std[at] * abs(unknowns.slopes[at]))
+    if not added_kg < -_SEEN * own_std_kg:
+        return ()
+    return (
+        f"{ADDED_INERTIA} is {added_kg:.3g} kg, {-added_kg / own_std_kg:.3g} standard deviations "
+        "below 0, but no inertia is negative. A dimension, the density or the actuator's own mass "
+        "in [actuator.parameters], a mass or the clock is wrong, and so may be moduli, "
+        "permittivity and damping. Their intervals do not allow for it.",
+    )
+
+
+def _factor(assumed: float, segments: Sequence[Segment], channel: str, residuals: Floats) -> float:
+    """True over stated standard deviation of the noise; 1 where no record states it."""
+    stated = [part for part in segments if not part.std_estimated]
+    noise = noise_of(channel_of(stated, channel, residuals))
+    if np.isfinite(noise):
+        return assumed * noise
+    return 1.0 if channel_of(segments, channel, residuals) else float("nan")
 
 
 def _unseen(unknowns: Unknowns, std: Floats) -> NDArray[np.bool_]:

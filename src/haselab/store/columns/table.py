@@ -264,11 +264,24 @@ def _times(
                 f"Column {options.time} has no times: each row needs a number of seconds, or of "
                 f"the unit that --unit states. Name another column with --time: {archive.file}"
             )
-        return None, None, why
+        return None, None, why or _incomplete(name, times, kept)
     time_s = np.asarray(times[kept], dtype=np.float64)
     if not surely and not (np.diff(time_s) > 0.0).all():
         return None, None, f"Column {name} does not rise everywhere."
     return name, time_s, ""
+
+
+def _incomplete(name: str, times: NDArray[Any] | None, kept: NDArray[np.bool_]) -> str:
+    """Say which row of some times is not finite; empty if most are not."""
+    if times is None or times.size != kept.size:
+        return ""
+    rows = np.flatnonzero(kept & ~np.isfinite(times))
+    if rows.size > 0.5 * np.count_nonzero(kept):
+        return ""
+    return (
+        f"Column {name} has {times[rows[0]]:g} in row {rows[0] + 1} ({rows.size} such rows): "
+        "remove these rows, or write their times."
+    )
 
 
 def _finite(name: str, values: NDArray[Any], file: Path, *, may_lack: bool) -> Floats:

@@ -29,7 +29,8 @@ class GridMargins:
 
     Args:
         phase_margin_deg: smallest distance of the phase from -180 degrees next to a crossover.
-        gain_margin_db: smallest change of gain, up or down, to a crossing of the negative real axis.
+        gain_margin_db: smallest change of gain, up or down, to a crossing of the negative
+            real axis.
         peak_sensitivity: largest `|1/(1 + L)|` on the grid.
         crossover_rad_s: highest crossover, 0 without one.
         stable: whether the loop is stable by the encirclement count on the grid.

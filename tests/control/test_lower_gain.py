@@ -7,7 +7,8 @@ import control
 import numpy as np
 import pytest
 
-from haselab.control import DesignSpec, LoopSetting, PidGains, design_pid
+from haselab.base import InputError
+from haselab.control import DesignSpec, LoopSetting, PidGains, design_pi, design_pid
 from haselab.control.stability.grid import PlantGrid
 from haselab.control.stability.margins import margins
 from haselab.models.rational import RationalModel
@@ -90,3 +91,38 @@ def test_a_design_keeps_its_gain_margin_in_both_directions():
     assert design.nominal.margins.gain_margin_db > 5.9
     for change_db in (-5.9, 5.9):
         assert radius(TWICE, scaled(design.gains, 10.0 ** (change_db / 20.0))) < 1.0
+
+
+@pytest.mark.long
+def test_an_unstable_plant_of_negative_static_gain_is_designed_for():
+    """10/(s - 2) has the static gain -5; gains above 0 stabilise it."""
+    spec = DesignSpec(phase_margin_deg=40.0, gain_margin_db=3.0, overshoot=0.6)
+    design = design_pi(UNSTABLE, spec, LoopSetting(50.0, 0.0), rng=np.random.default_rng(0))
+    assert design.shortfalls == ()
+    # The same loop, simulated with the solution of x' = 2 x + 10 u between the samples.
+    grown, size = math.exp(2.0 / 50.0), design.spec.step
+    x, integral, outputs = 0.0, 0.0, []
+    for _ in range(1250):
+        error = size - x
+        integral += design.gains.ki / 50.0 * error
+        u = design.gains.kp * error + integral
+        assert -0.05 < u < 0.1  # the usual limits are not reached
+        x = grown * x + 5.0 * (grown - 1.0) * u
+        outputs.append(x)
+    assert outputs[-1] == pytest.approx(size, rel=spec.steady_state_error)
+    # The peak is read after smoothing over a tenth of the rise.
+    assert max(outputs) / size - 1.0 == pytest.approx(design.nominal.step.overshoot, abs=0.02)
+
+
+@pytest.mark.parametrize(
+    ("numerator", "denominator", "message"),
+    [
+        ([-4.0], [1.0, 3.0, -4.0], "plant numerator's last term = -4; it must be above 0"),
+        ([-4.0], [1.0, 3.0, 4.0], "plant static gain = -1; it must be above 0"),
+        ([1.0, 0.0], [1.0, 3.0, 4.0], "The plant has a zero at s = 0: with a constant input"),
+    ],
+)
+def test_a_plant_that_no_gain_above_0_stabilises_is_refused(numerator, denominator, message):
+    plant = RationalModel(numerator, denominator)
+    with pytest.raises(InputError, match=message):
+        design_pi(plant, DesignSpec(), LoopSetting(), rng=np.random.default_rng(0))

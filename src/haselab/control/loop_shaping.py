@@ -254,14 +254,40 @@ def _frequency(plant: AnyPlant) -> float:
 def _reachable(task: Task, gain: float) -> None:
     """Refuse a step that the limits do not allow."""
     limits, step = task.setting.saturation, task.step
-    if integrates(task.plant) or gain * limits.low <= step <= gain * limits.high:
+    low, high = sorted((gain * limits.low, gain * limits.high))
+    if integrates(task.plant) or low <= step <= high:
         return
     raise ResultError(
         f"The output saturates: the demanded step of {step:g} needs a controller output of "
         f"{step / gain:.3g}, but the limits are {limits.low:g} to {limits.high:g}. State a step of "
-        f"{gain * limits.low:.3g} to {gain * limits.high:.3g} in the demands (step), or widen the "
-        "limits."
+        f"{low:.3g} to {high:.3g} in the demands (step), or widen the limits."
     )
+
+
+def _positive(plant: AnyPlant) -> None:
+    """Refuse a plant that no controller with integral action and gains above 0 stabilises.
+
+    The constant term of the closed loop's characteristic polynomial is ki times that of the
+    numerator, and has the sign of the leading term, 1, if the loop is stable. The static gain may
+    be negative: an odd number of unstable poles makes it so.
+    """
+    if isinstance(plant, Plant):
+        gains = {"gain": plant.gain, "static gain": plant.static_gain}
+    else:
+        static, last = PlantScale.of(plant).gain, plant.numerator[-1]
+        gains = {"static gain": static} if static * last > 0.0 else {"numerator's last term": last}
+    if 0.0 in gains.values():
+        raise InputError(
+            "The plant has a zero at s = 0: with a constant input its output returns to 0, so no "
+            "controller holds a step. Choose another output, or identify without this zero."
+        )
+    for what, gain in gains.items():
+        if gain < 0.0:
+            raise InputError(
+                f"plant {what} = {gain:g}; it must be above 0, as the controller gains are. "
+                "Negate the input column and identify again (the model then has a gain above 0), "
+                "give --limits as -HIGH -LOW, and negate the controller's output on the bench."
+            )
 
 
 def design_task(task: Task, rng: np.random.Generator, *, derivative: bool) -> Design:
@@ -279,15 +305,10 @@ def design_task(task: Task, rng: np.random.Generator, *, derivative: bool) -> De
         ResultError: no stable loop was found, or the limits do not allow the step.
     """
     scale = PlantScale.of(task.plant)
+    _positive(task.plant)
     resonance = task.plant.gain if isinstance(task.plant, Plant) else scale.gain
     for what, gain in (("gain", resonance), ("static gain", scale.gain)):
-        if not gain > 0.0:
-            raise InputError(
-                f"plant {what} = {gain:g}; it must be above 0, as the controller gains are. "
-                "Negate the input column and identify again (the model then has a gain above 0), "
-                "give --limits as -HIGH -LOW, and negate the controller's output on the bench."
-            )
-        if not 1.0 / _LARGEST_GAIN <= gain <= _LARGEST_GAIN:
+        if not 1.0 / _LARGEST_GAIN <= abs(gain) <= _LARGEST_GAIN:
             raise InputError(
                 f"plant {what} = {gain:g}; it must be {1.0 / _LARGEST_GAIN:g} to "
                 f"{_LARGEST_GAIN:g}. Choose other units for the input and output."
@@ -391,8 +412,9 @@ class _Space:
 
     def _wide_gains(self, point: NDArray[np.float64], period_s: float) -> PidGains:
         scale = PlantScale.of(self.task.plant)
-        least = 1e-2 / scale.gain
-        most = 10.0 / min(scale.gain, scale.least_gain)
+        gain = abs(scale.gain)  # negative with an odd number of unstable poles
+        least = 1e-2 / gain
+        most = 10.0 / min(gain, scale.least_gain)
         fastest = min(scale.fast_rad_s, math.pi / period_s)
         kp = _logarithmic(float(point[0]), least, most)
         slowest_ki, fastest_ki = 1e-2 * scale.slow_rad_s * least, fastest * most

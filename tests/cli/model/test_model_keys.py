@@ -63,7 +63,7 @@ def record(tmp_path):
     "command",
     [
         ("transfer",),
-        ("transfer", "--zeros", "1"),
+        ("transfer", "--zeros", "1", "--delay", "0.01"),
         ("transfer", "--choose", "zeros"),
         ("transfer", "--bootstrap", "100"),
         ("transfer", "--nonlinear", "hammerstein-2"),

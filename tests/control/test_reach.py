@@ -74,3 +74,24 @@ def test_a_study_of_such_an_actuator_has_its_baseline_at_the_lowest_drive():
     assert known.operating_point.baseline_v is not None
     # Within one step of the grid of `reach`, 0.1225 / 1500, times the slope of 60 V.
     assert 0.0 <= known.operating_point.baseline_v < 5e-3
+
+
+@pytest.mark.parametrize(
+    ("step", "drive_v", "message"),
+    [
+        # Eq. 4 of the paper: 1.043 V at zero strain, 1.6 V at a strain of 0.0692.
+        (0.08, (0.0, 1.6), r"needs 1\.667 V .* 0 to 1\.6 V\. Choose a step between 0 and 0\.069"),
+        (0.03, (1.2, 1.6), r"starts at zero strain, which needs 1\.044 V"),
+    ],
+)
+def test_an_open_step_that_the_drive_does_not_reach_is_refused_before_the_run(
+    step, drive_v, message
+):
+    eq4 = {"a1_v": 1.324, "b1": 3.124, "a2_v": -0.2805, "b2": -26.92}
+    section = eq4 | {"strain_low": -0.05, "strain_high": 0.1}
+    drive = {"low_v": drive_v[0], "high_v": drive_v[1], "voltage_map": section}
+    steps = {"step": step, "zero_s": 4.0, "step_s": 6.0, "rest_s": 10.0, "frame_rate_hz": 20.0}
+    steps |= {"open_trials": 1, "pi_trials": 0, "pid_trials": 0}
+    study = Study.model_validate({"name": "far", "steps": steps})
+    with pytest.raises(InputError, match=message):
+        with_actuator_tables(study, ActuatorTables.model_validate({"drive": drive}))

@@ -139,6 +139,16 @@ def test_a_load_moves_the_played_loop_as_its_linear_loop_says(
     assert gap < 0.1 * np.abs(linear).max()
 
 
+@pytest.mark.parametrize("kind", ["chip-force", "chip-observer"])
+def test_the_design_for_such_an_actuator_is_refused_before_its_search(kind, monkeypatch) -> None:
+    monkeypatch.setattr("haselab.controllers.chip.force.design_force", None)
+    setting = setting_of(true_actuator(find_device("peano-hasel")), 0.0)
+    design = CONTROLLERS.find(kind).design
+    assert design is not None
+    with pytest.raises(InputError, match="not proportional to the square"):
+        design(setting)
+
+
 def test_an_actuator_whose_force_is_not_that_of_a_square_is_refused() -> None:
     peano = true_actuator(find_device("peano-hasel"))
     with pytest.raises(InputError, match="not proportional to the square"):

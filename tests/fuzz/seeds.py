@@ -47,8 +47,8 @@ RATIONAL = {
     "numerator": [1.0],
     "denominator": [1.0, 0.4, 30.0],
     "delay_s": 0.01,
-    "input_name": "u",
-    "output_name": "y",
+    "input": "u",
+    "output": "y",
 }
 SPEC = """phase_margin_deg = 45.0
 gain_margin_db = 6.0

@@ -18,7 +18,8 @@ from haselab.control.candidates import Task, plant_crossover, score
 from haselab.control.charts import step_chart
 from haselab.control.gains import PidGains
 from haselab.control.plants.general import AnyPlant, PlantScale
-from haselab.control.plants.general_loops import trace_general
+from haselab.control.plants.general_loops import closed_loop_poles, trace_general
+from haselab.control.plants.modes import SampledLoops
 from haselab.control.reach import integrates
 from haselab.control.simulate import LoopSetting, simulate_loop
 from haselab.control.spec import DesignSpec
@@ -44,6 +45,9 @@ _NAME_WIDTH = 28
 _MEMBERS = 12  # candidates per generation and unknown
 _GENERATIONS = 45
 _MOST_DELAY = 50  # updates; above, a search takes minutes
+_DECAYS = 6.0  # time constants after which a response of the size of the step has settled
+_LONGEST_RECORD = 16.0  # of the demanded record, simulated for the settling time
+_MOST_SAMPLES = 250_000  # of such a record
 _LARGEST_GAIN = 1e30  # of a plant; far above, products of gains overflow
 
 
@@ -231,17 +235,48 @@ def predict(
     if not found.stable:
         nothing = StepNumbers(*[math.nan] * len(dataclasses.fields(StepNumbers)))
         return Prediction(_frequency(plant), found, nothing, math.nan)
+    first, peak = _simulated(plant, gains, setting, step, record_s)
+    longer_s = min(_DECAYS * _slowest_s(plant, gains, setting), _LONGEST_RECORD * record_s)
+    longer_s = min(longer_s, _MOST_SAMPLES / setting.rate_hz)
+    if gains.ki == 0.0 or longer_s <= record_s:
+        return Prediction(_frequency(plant), found, first, peak)
+    numbers, _ = _simulated(plant, gains, setting, step, longer_s)
+    # The error and the rise are those of the record that the demands refer to.
+    settled = dataclasses.replace(first, settling_time_s=numbers.settling_time_s)
+    return Prediction(_frequency(plant), found, settled, peak)
+
+
+def _slowest_s(plant: AnyPlant, gains: PidGains, setting: LoopSetting) -> float:
+    """Longest time constant of the closed loop, in s."""
+    period_s, delay_s = 1.0 / setting.rate_hz, setting.measurement_delay_s
+    if isinstance(plant, Plant):
+        loops = SampledLoops.of([plant], [gains], period_s=period_s, measurement_delay_s=delay_s)
+        poles = loops.poles()[0]
+    else:
+        poles = closed_loop_poles(plant, [gains], setting)[0]
+    size = min(float(np.abs(poles).max()), 1.0 - 1e-12)
+    return -period_s / math.log(size) if size > 0.0 else 0.0
+
+
+def _simulated(
+    plant: AnyPlant, gains: PidGains, setting: LoopSetting, step: float, record_s: float
+) -> tuple[StepNumbers, float]:
+    """Metrics of a simulated step, and the largest magnitude of the output in it.
+
+    With integral action the response ends at the reference.
+    """
     before = round(setting.rate_hz)
     reference = np.r_[np.zeros(before), np.full(round(record_s * setting.rate_hz), step)]
+    reaches = gains.ki > 0.0
     if not isinstance(plant, Plant):
         measured, u = trace_general(plant, [gains], reference, setting)
         time_s = np.arange(reference.size) / setting.rate_hz
-        general = step_metrics(time_s, measured[0], reference).trials[0]
-        return Prediction(_frequency(plant), found, general, float(np.abs(u).max()))
+        general = step_metrics(time_s, measured[0], reference, reaches=reaches).trials[0]
+        return general, float(np.abs(u).max())
     trace = simulate_loop(plant, gains, reference, setting)
     desired = np.repeat(reference, setting.points_per_sample)
-    numbers = step_metrics(trace.time_s, trace.y, desired).trials[0]
-    return Prediction(_frequency(plant), found, numbers, float(np.abs(trace.u).max()))
+    numbers = step_metrics(trace.time_s, trace.y, desired, reaches=reaches).trials[0]
+    return numbers, float(np.abs(trace.u).max())
 
 
 def _frequency(plant: AnyPlant) -> float:
@@ -254,14 +289,40 @@ def _frequency(plant: AnyPlant) -> float:
 def _reachable(task: Task, gain: float) -> None:
     """Refuse a step that the limits do not allow."""
     limits, step = task.setting.saturation, task.step
-    if integrates(task.plant) or gain * limits.low <= step <= gain * limits.high:
+    low, high = sorted((gain * limits.low, gain * limits.high))
+    if integrates(task.plant) or low <= step <= high:
         return
     raise ResultError(
         f"The output saturates: the demanded step of {step:g} needs a controller output of "
         f"{step / gain:.3g}, but the limits are {limits.low:g} to {limits.high:g}. State a step of "
-        f"{gain * limits.low:.3g} to {gain * limits.high:.3g} in the demands (step), or widen the "
-        "limits."
+        f"{low:.3g} to {high:.3g} in the demands (step), or widen the limits."
     )
+
+
+def _positive(plant: AnyPlant) -> None:
+    """Refuse a plant that no controller with integral action and gains above 0 stabilises.
+
+    The constant term of the closed loop's characteristic polynomial is ki times that of the
+    numerator, and has the sign of the leading term, 1, if the loop is stable. The static gain may
+    be negative: an odd number of unstable poles makes it so.
+    """
+    if isinstance(plant, Plant):
+        gains = {"gain": plant.gain, "static gain": plant.static_gain}
+    else:
+        static, last = PlantScale.of(plant).gain, plant.numerator[-1]
+        gains = {"static gain": static} if static * last > 0.0 else {"numerator's last term": last}
+    if 0.0 in gains.values():
+        raise InputError(
+            "The plant has a zero at s = 0: with a constant input its output returns to 0, so no "
+            "controller holds a step. Choose another output, or identify without this zero."
+        )
+    for what, gain in gains.items():
+        if gain < 0.0:
+            raise InputError(
+                f"plant {what} = {gain:g}; it must be above 0, as the controller gains are. "
+                "Negate the input column and identify again (the model then has a gain above 0), "
+                "give --limits as -HIGH -LOW, and negate the controller's output on the bench."
+            )
 
 
 def design_task(task: Task, rng: np.random.Generator, *, derivative: bool) -> Design:
@@ -279,15 +340,10 @@ def design_task(task: Task, rng: np.random.Generator, *, derivative: bool) -> De
         ResultError: no stable loop was found, or the limits do not allow the step.
     """
     scale = PlantScale.of(task.plant)
+    _positive(task.plant)
     resonance = task.plant.gain if isinstance(task.plant, Plant) else scale.gain
     for what, gain in (("gain", resonance), ("static gain", scale.gain)):
-        if not gain > 0.0:
-            raise InputError(
-                f"plant {what} = {gain:g}; it must be above 0, as the controller gains are. "
-                "Negate the input column and identify again (the model then has a gain above 0), "
-                "give --limits as -HIGH -LOW, and negate the controller's output on the bench."
-            )
-        if not 1.0 / _LARGEST_GAIN <= gain <= _LARGEST_GAIN:
+        if not 1.0 / _LARGEST_GAIN <= abs(gain) <= _LARGEST_GAIN:
             raise InputError(
                 f"plant {what} = {gain:g}; it must be {1.0 / _LARGEST_GAIN:g} to "
                 f"{_LARGEST_GAIN:g}. Choose other units for the input and output."
@@ -391,8 +447,9 @@ class _Space:
 
     def _wide_gains(self, point: NDArray[np.float64], period_s: float) -> PidGains:
         scale = PlantScale.of(self.task.plant)
-        least = 1e-2 / scale.gain
-        most = 10.0 / min(scale.gain, scale.least_gain)
+        gain = abs(scale.gain)  # negative with an odd number of unstable poles
+        least = 1e-2 / gain
+        most = 10.0 / min(gain, scale.least_gain)
         fastest = min(scale.fast_rad_s, math.pi / period_s)
         kp = _logarithmic(float(point[0]), least, most)
         slowest_ki, fastest_ki = 1e-2 * scale.slow_rad_s * least, fastest * most

@@ -27,10 +27,10 @@ class StepNumbers:
     Args:
         rise_time_s: 10 to 90 % of the way to the final value, with ringing averaged out, in s.
         raw_rise_time_s: the same for the unprocessed response, including ringing, in s.
-        overshoot: largest excess over the final value, relative to the step, including ringing.
+        overshoot: largest excess over the final value, relative to it, including ringing.
         ring_averaged_overshoot: the same with the ringing averaged out.
-        settling_time_s: time from the step after which the response stays within 2 % of the step
-            around its final value, in s; NaN if it still leaves that band in the last tenth.
+        settling_time_s: time from the step after which the response stays within 2 % of its final
+            value, in s; NaN if it still leaves that band in the last tenth.
         steady_state_error: reference minus final value, relative to the reference's step.
         peak_excess: largest excess over the reference, relative to the reference's step, including
             ringing; 0 if the response stays below. It compares responses that end at different
@@ -89,7 +89,12 @@ class StepMetrics:
 
 
 def step_metrics(
-    time_s: ArrayLike, y: ArrayLike, reference: ArrayLike, *, ringing: Ringing | None = None
+    time_s: ArrayLike,
+    y: ArrayLike,
+    reference: ArrayLike,
+    *,
+    ringing: Ringing | None = None,
+    reaches: bool = False,
 ) -> StepMetrics:
     """Compute the metrics of repeated step experiments.
 
@@ -101,6 +106,8 @@ def step_metrics(
         y: responses in strain, one row per trial. Shape `(trials, N)` or `(N,)`.
         reference: desired strain; it changes once. Shape `(N,)`.
         ringing: ringing to average out, found in the data if not given.
+        reaches: whether the response is known to reach the reference in the end: overshoot and
+            settling are then relative to it, not to the record's last tenth.
     Returns:
         Estimates over the trials.
     Raises:
@@ -124,7 +131,7 @@ def step_metrics(
     size = float(desired[-1] - desired[0])
     numbers = tuple(
         step_numbers(row * math.copysign(1.0, size), abs(size), goal * math.copysign(1.0, size),
-                     rate_hz=rate_hz, ringing=found)
+                     rate_hz=rate_hz, ringing=found, reaches=reaches)
         for row, goal in zip(moved, wanted, strict=True)
     )  # fmt: skip
 
@@ -154,6 +161,7 @@ def step_numbers(
     *,
     rate_hz: float,
     ringing: Ringing | None,
+    reaches: bool = False,
 ) -> StepNumbers:
     """Compute the metrics of one response, given from the step on.
 
@@ -163,6 +171,7 @@ def step_numbers(
         wanted: reference minus the level before the step.
         rate_hz: sampling rate, in Hz.
         ringing: ringing to average out; None to smooth only.
+        reaches: see `step_metrics`.
     Returns:
         The metrics.
     Raises:
@@ -181,13 +190,14 @@ def step_numbers(
         window_s = 0.2 * 2.0 * math.pi / ringing.omega_rad_s
     clean = smooth_lightly(moved, window_s, rate_hz)
     averaged = clean if ringing is None else average_out(moved, ringing, rate_hz)
-    outside = np.flatnonzero(np.abs(clean - final) > _SETTLED * final)
+    goal = wanted if reaches else final
+    outside = np.flatnonzero(np.abs(clean - goal) > _SETTLED * goal)
     settled = int(outside[-1]) + 1 if outside.size else 0
     return StepNumbers(
         rise_time_s=_rise_time(averaged, final, rate_hz),
         raw_rise_time_s=rough_s,
-        overshoot=max(0.0, float(clean.max()) / final - 1.0),
-        ring_averaged_overshoot=max(0.0, float(averaged.max()) / final - 1.0),
+        overshoot=max(0.0, float(clean.max()) / goal - 1.0),
+        ring_averaged_overshoot=max(0.0, float(averaged.max()) / goal - 1.0),
         settling_time_s=settled / rate_hz if settled < moved.size - last.size else math.nan,
         steady_state_error=(wanted - final) / size,
         peak_excess=max(0.0, (float(clean.max()) - wanted) / size),

@@ -160,7 +160,7 @@ class RunningController:
             )
         if self._voltage and not self._low <= value <= self._high:
             raise SafetyError(
-                f"Controller {self._name!r} returned {value:.6g} V, outside its limits of "
-                f"{self._low:g} to {self._high:g} V. Limit the voltage in the controller."
+                f"Controller {self._name!r} returned {value:.12g} V, outside its limits of "
+                f"{self._low:.12g} to {self._high:.12g} V. Limit the voltage in the controller."
             )
         return min(max(value, self._low), self._high)

@@ -11,7 +11,7 @@ from haselab.controllers import CONTROLLERS, KnownActuator, known_actuator
 from haselab.models.actuator import ActuatorTables
 from haselab.models.maps import allow_start
 from haselab.study.definition import Study
-from haselab.study.fits.maps import Maps
+from haselab.study.fits.maps import Maps, require_open_steps
 from haselab.study.fits.resolution import ZERO_PX
 from haselab.study.tables import Control, OperatingPoint
 
@@ -49,8 +49,18 @@ def with_actuator_tables(study: Study, tables: ActuatorTables) -> Study:
         of the actuator file, within its limits.
     Raises:
         InputError: the controller's kind is not registered, does not accept its parameters, or has
-            no limits.
+            no limits; or the drive does not reach an open-loop step.
     """
+    steps = study.steps if study.has("steps") else None
+    to_volt = tables.drive.voltage_map
+    if steps and steps.open_trials and to_volt is not None and not study.has("triangle"):
+        low_v, high_v = tables.drive_ends_v()
+        require_open_steps(
+            to_volt.map(),
+            steps.step,
+            -math.inf if low_v is None else low_v,
+            math.inf if high_v is None else high_v,
+        )
     changes: dict[str, object] = {}
     open_point = study.operating_point.baseline_v is None and not study.has("triangle")
     if open_point and tables.drive.voltage_map is not None:

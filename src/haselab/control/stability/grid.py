@@ -19,6 +19,7 @@ from haselab.control.stability.margins import frequency_grid
 __all__ = ["GridMargins", "PlantGrid"]
 
 _TYPICAL = PidGains(1.0, 1.0, 0.1)  # determines the range of the grid
+_REAL = 0.1  # |imaginary part| over the size of a response that counts as real
 _LARGEST_TURN = 1.5  # rad between neighbours; half a turn would hide a whole one
 
 
@@ -28,7 +29,8 @@ class GridMargins:
 
     Args:
         phase_margin_deg: smallest distance of the phase from -180 degrees next to a crossover.
-        gain_margin_db: smallest increase of gain to a crossing of the negative real axis.
+        gain_margin_db: smallest change of gain, up or down, to a crossing of the negative
+            real axis.
         peak_sensitivity: largest `|1/(1 + L)|` on the grid.
         crossover_rad_s: highest crossover, 0 without one.
         stable: whether the loop is stable by the encirclement count on the grid.
@@ -104,12 +106,12 @@ class PlantGrid:
         np.minimum.at(phase_deg, row, _phase(loop[row, at], loop[row, at + 1], between))
         upper = loop.imag > 0.0
         turns = (upper[:, 1:] != upper[:, :-1]) & (loop.real[:, 1:] < 0.0)
-        reach = np.zeros(len(candidates))
+        gain_db = np.full(len(candidates), np.inf)
         row, at = np.nonzero(turns)
-        value = _reach(loop[row, at], loop[row, at + 1], between)
-        np.maximum.at(reach, row, np.where((value > 0.0) & (value < 1.0), value, 0.0))
-        with np.errstate(divide="ignore"):
-            gain_db = -20.0 * np.log10(reach)
+        np.minimum.at(gain_db, row, _change_db(_reach(loop[row, at], loop[row, at + 1], between)))
+        for end in (loop[:, 0], loop[:, -1]):  # a response without integrator is real there
+            real = np.abs(end.imag) < _REAL * np.abs(end)
+            gain_db = np.minimum(gain_db, np.where(real, _change_db(-end.real), np.inf))
         return GridMargins(
             phase_margin_deg=phase_deg,
             gain_margin_db=gain_db,
@@ -149,6 +151,12 @@ def _phase(
     turn -= 2.0 * math.pi * np.round(turn / (2.0 * math.pi))
     at = np.abs(first + sizes[0] / (sizes[0] - sizes[1]) * turn)
     return np.asarray(np.degrees(np.minimum(at, np.abs(2.0 * math.pi - at))))
+
+
+def _change_db(reach: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Change of gain that moves a crossing to -1, in dB; infinite for one right of the origin."""
+    left = reach > 0.0
+    return np.where(left, np.abs(20.0 * np.log10(np.where(left, reach, 1.0))), np.inf)
 
 
 def _reach(

@@ -45,8 +45,8 @@ class Margins:
         stable: whether the closed loop is stable.
         phase_margin_deg: the smallest distance over all crossovers, in degrees; negative when
             the closed loop is unstable, infinite without a crossover.
-        gain_margin_db: the smallest increase of gain that makes the loop unstable, in dB,
-            infinite if none does. For an unstable loop, the (negative) change of gain to the
+        gain_margin_db: the smallest change of gain, up or down, that makes the loop unstable, in
+            dB, infinite if none does. For an unstable loop, the (negative) change of gain to the
             nearest lower crossing, NaN if there is none.
         gain_margin_rad_s: frequency of that instability, in rad/s (NaN when there is none).
         delay_margin_s: the smallest added delay that makes the loop unstable, in s.
@@ -210,6 +210,7 @@ def margins(
     stable = unstable == 0
     crossovers = _gain_crossovers(response, omega, loop)
     factor, factor_at = _gain_margin(_axis_crossings(response, omega, loop), stable=stable)
+    change_db = 20.0 * math.log10(factor)
     peak, peak_at = _peak_sensitivity(response, omega, loop)
     worst = min((abs(item.phase_margin_deg) for item in crossovers), default=math.inf)
     delay = min(
@@ -220,7 +221,7 @@ def margins(
         stable=stable,
         unstable_poles=unstable,
         phase_margin_deg=worst if stable else -worst,
-        gain_margin_db=20.0 * math.log10(factor),
+        gain_margin_db=abs(change_db) if stable else change_db,
         gain_margin_rad_s=factor_at,
         delay_margin_s=delay if stable else 0.0,
         peak_sensitivity=peak,
@@ -333,8 +334,10 @@ def _roots(
 
 
 def _gain_margin(crossings: list[tuple[float, float]], *, stable: bool) -> tuple[float, float]:
+    """Gain factor to the limit of stability, and its frequency."""
     if stable:
-        return min((item for item in crossings if item[0] > 1.0), default=(math.inf, math.nan))
+        nearest = (math.inf, math.nan)
+        return min(crossings, key=lambda item: abs(math.log(item[0])), default=nearest)
     return max((item for item in crossings if item[0] < 1.0), default=(math.nan, math.nan))
 
 

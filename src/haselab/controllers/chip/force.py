@@ -17,6 +17,7 @@ from haselab.controllers.chip.loop import chip_setting
 from haselab.controllers.chip.motion_record import (
     as_q,
     motion_record,
+    require_square_law,
     sensed_strain,
     set_lag,
 )
@@ -92,6 +93,8 @@ def _design(setting: ControllerSetting) -> Mapping[str, float]:
     Returns:
         The parameters of `ChipForceController`.
     """
+    assert setting.actuator is not None, "the kind needs it"
+    require_square_law(setting.actuator)  # before a search of a minute
     found = dict(design_force(setting, _DEMANDS))
     del found["reference_s"]
     return {**found, "reserve": _RESERVE}

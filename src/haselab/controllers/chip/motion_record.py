@@ -20,7 +20,15 @@ from haselab.controllers.motion_model import MotionModel
 from haselab.controllers.protocol import ControllerSetting, Measurement
 from haselab.controllers.reference_plan import ReferencePlan
 
-__all__ = ["MotionRecord", "as_q", "lag_of", "motion_record", "sensed_strain", "set_lag"]
+__all__ = [
+    "MotionRecord",
+    "as_q",
+    "lag_of",
+    "motion_record",
+    "require_square_law",
+    "sensed_strain",
+    "set_lag",
+]
 
 Floats = NDArray[np.float64]
 _ONE, _FULL = 2.0**30, 32767
@@ -143,6 +151,21 @@ def set_lag(gains: NDArray[np.void], motion: MotionRecord, setting: ControllerSe
     gains["lag_square"] = as_q(square, 16, "The delay")
 
 
+def require_square_law(known: KnownActuator) -> None:
+    """Refuse an actuator whose electric force is not proportional to the square of the voltage.
+
+    Args:
+        known: the actuator.
+    Raises:
+        InputError: it is such an actuator.
+    """
+    if len(known.table.pull_n_v2) > 1:
+        raise InputError(
+            "The electric force of this actuator is not proportional to the square of the "
+            "voltage, which the step in integers requires. Use 'force' or 'observer' at 100 Hz."
+        )
+
+
 def motion_record(setting: ControllerSetting, reserve: float) -> MotionRecord:
     """Compute tables and units.
 
@@ -158,11 +181,7 @@ def motion_record(setting: ControllerSetting, reserve: float) -> MotionRecord:
     assert setting.actuator is not None, "the kind needs it"
     known = setting.actuator
     known = replace(known, high_v=min(known.high_v, setting.drive_high))
-    if len(known.table.pull_n_v2) > 1:
-        raise InputError(
-            "The electric force of this actuator is not proportional to the square of the "
-            "voltage, which the step in integers requires. Use 'force' or 'observer' at 100 Hz."
-        )
+    require_square_law(known)
     knots = _core.MOTION["rest"].shape[0]
     reach = known.reachable()
     margin = _BEYOND * (reach[1] - reach[0])

@@ -23,6 +23,7 @@ from haselab.models.actuator.sections import missing
 from haselab.models.plant import Plant, SlowMode
 from haselab.models.posterior import PlantPosterior
 from haselab.models.rational import RationalModel
+from haselab.pipelines.design.model_keys import refuse_unknown_keys
 from haselab.store.actuator_file import read_actuator, read_run
 from haselab.store.columns.mat_struct import read_mat_struct
 from haselab.store.folder import read_json
@@ -88,7 +89,9 @@ def read_model(path: Path) -> RationalModel:
 def _data(path: Path) -> Any:
     """The content of a model.json, or `[model]` of an actuator file in the same form."""
     if path.suffix.lower() != ".toml":
-        return read_json(path)
+        data = read_json(path)
+        refuse_unknown_keys(data, path)
+        return data
     sections = read_actuator(path)
     model = sections.get("model")
     table = model if isinstance(model, dict) else {}

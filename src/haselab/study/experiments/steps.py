@@ -18,7 +18,7 @@ from haselab.study.definition import Study
 from haselab.study.experiment import Experiment, ExperimentResult
 from haselab.study.fits.further import further_trials, rows_without, saturating_reference
 from haselab.study.fits.loops import Loops, loop_saturation
-from haselab.study.fits.maps import Maps
+from haselab.study.fits.maps import Maps, require_open_steps
 from haselab.study.fits.observe import Observation
 from haselab.study.fits.paper_chain import PrintedChain
 from haselab.study.fits.trials import Comparison, compare_trials
@@ -114,10 +114,14 @@ class StepTest(Experiment[Steps]):
     def play(self, player: Player) -> None:
         """See `Experiment`."""
         steps, analysis = self.settings, player.analysis
-        to_volt = analysis.to_play(Maps).voltage_map
+        to_volt, limits_v = analysis.to_play(Maps).voltage_map, analysis.rig.drive_limits
+        if steps.open_trials:
+            require_open_steps(to_volt, steps.step, limits_v.low, limits_v.high)
         for name in open_names(self.study):
             player.settle(0.0, steps.rest_s)
-            player.play(name, to_volt.voltage_v(step_reference(steps)), steps.frame_rate_hz)
+            drive_v = to_volt.voltage_v(step_reference(steps))
+            # Zero strain may be just outside the drive.
+            player.play(name, np.clip(drive_v, limits_v.low, limits_v.high), steps.frame_rate_hz)
         player.rest()  # while the controllers are designed
         for group, loop in self._loops(analysis).items():
             saturates = group == "saturating"

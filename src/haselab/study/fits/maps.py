@@ -9,18 +9,19 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from haselab.base import Estimate, JsonObject, ResultError
+from haselab.base import Estimate, InputError, JsonObject, ResultError
 from haselab.identify.noise import coloured_covariance
 from haselab.identify.statics.capacitance_map import fit_capacitance_map
 from haselab.identify.statics.voltage_map import VoltageMapFit, fit_voltage_map
 from haselab.models.actuator.strain_map import StrainMap
-from haselab.models.maps import VoltageMap
+from haselab.models.maps import VoltageMap, allow_start
 from haselab.sensing.strain import fit_strain_map
 from haselab.study.fits.cycles import Cycles, drive_at, repeatability
 from haselab.study.paper.paper_check import EQ_4
 
-__all__ = ["Maps", "fit_maps"]
+__all__ = ["Maps", "fit_maps", "require_open_steps"]
 
+_SAME_V = 1e-9  # rounding of a voltage from the map
 _COMPARED = (-0.05, 0.10)  # range of the printed saturation, where two maps are compared
 _INSEPARABLE = (
     "not identifiable from this loop, which does not separate two exponentials; its interval only "
@@ -229,3 +230,35 @@ def _figures(
             "reconstructed_band": maps.strain_map.band,
         },
     }
+
+
+def require_open_steps(to_volt: VoltageMap, step: float, low_v: float, high_v: float) -> None:
+    """Refuse open-loop steps that the drive does not reach through the voltage map.
+
+    Args:
+        to_volt: strain to drive voltage.
+        step: strain after the step; each trial starts at zero strain, or at the end of the drive if
+            zero strain is just outside, see `allow_start`.
+        low_v: lowest drive, in V.
+        high_v: highest drive, in V.
+    Raises:
+        InputError: the voltage of zero strain, or of the step, is not within the drive.
+    """
+    ends = f"the drive is limited to {low_v:g} to {high_v:g} V"
+    zero_v, step_v = (float(to_volt.voltage_v(strain)) for strain in (0.0, step))
+    reach = to_volt.reach((to_volt.strain_low, to_volt.strain_high), low_v, high_v)
+    starts = reach is not None and allow_start(reach)
+    if not starts and not low_v - _SAME_V <= zero_v <= high_v + _SAME_V:
+        raise InputError(
+            f"A step trial starts at zero strain, which needs {zero_v:.4g} V by the voltage map, "
+            f"but {ends}. Change the limits of the drive, or define zero strain as the length at a "
+            "drive within these limits (zero_length_m) and fit the maps and the model again."
+        )
+    if low_v - _SAME_V <= step_v <= high_v + _SAME_V:
+        return
+    reach = to_volt.reach((min(step, 0.0), max(step, 0.0)), low_v, high_v) or (0.0, 0.0)
+    farthest = reach[0] if step < 0.0 else reach[1]
+    raise InputError(
+        f"step = {step:g} in [steps] is a strain that needs {step_v:.4g} V by the voltage map, but "
+        f"{ends}. Choose a step between 0 and {farthest:.3g}."
+    )

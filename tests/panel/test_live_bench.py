@@ -108,6 +108,25 @@ def test_a_study_that_computes_with_an_output_is_taken_to_zero_when_it_must_end(
     assert seen == [0.0]
 
 
+def test_a_stop_during_a_computation_shows_the_drive_of_the_output(
+    bench: tuple[LiveBench, GuardedRig], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    live, _ = bench
+    seen = []
+
+    def computing(study: Any, rig: GuardedRig, options: Any, progress: Any) -> None:
+        rig.safety.run()
+        rig.source.write(1.5)
+        rig.acquisition.read()
+        seen.append((live.state.stage, live.state.drive_v))
+        live.stop("STOP was pressed")
+        seen.append((live.state.stage, live.state.drive_v))
+
+    monkeypatch.setattr(study_player, "run_study", computing)
+    live.step()
+    assert seen == [("running", 1.5), ("tripped", 0.0)]
+
+
 def test_the_typed_limit_is_that_of_every_output_of_a_study(
     bench: tuple[LiveBench, GuardedRig], monkeypatch: pytest.MonkeyPatch
 ) -> None:

@@ -131,10 +131,13 @@ class LiveBench:
             stage = Stage.TRIPPED
         low, high = about.drive_limits.low, about.drive_limits.high
         limits, job = None, self._study.job
+        drive_v, target_v = self._drive_v, self._target_v
+        if stage is Stage.TRIPPED and self._rig.bench.requested_v == 0.0:
+            drive_v = target_v = 0.0  # a study that computes has not ended yet
         if self._loop is not None:
             limits = (self._loop.saturation.low, self._loop.saturation.high)
         return BenchState(
-            stage.value, self._mode, self._drive_v, self._target_v, self._reference,
+            stage.value, self._mode, drive_v, target_v, self._reference,
             self._limit_v, self._holder, latched or self._reason, low, high,
             about.amplifier_gain, limits, about.name, self._rig.simulated, self._player.task,
             self._player.done, self._player.prompt, self._player.step, tuple(self._events),

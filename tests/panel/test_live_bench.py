@@ -15,7 +15,7 @@ import numpy as np
 import pytest
 
 from haselab.api.design import Actuator
-from haselab.base import DeviceError, LimitError, Limits, SafetyError
+from haselab.base import DeviceError, LimitError, SafetyError
 from haselab.panel import study_player
 from haselab.panel.armed_study import ArmedStudy
 from haselab.panel.columns import LiveReader, LiveWriter
@@ -108,6 +108,25 @@ def test_a_study_that_computes_with_an_output_is_taken_to_zero_when_it_must_end(
     assert seen == [0.0]
 
 
+def test_a_stop_during_a_computation_shows_the_drive_of_the_output(
+    bench: tuple[LiveBench, GuardedRig], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    live, _ = bench
+    seen = []
+
+    def computing(study: Any, rig: GuardedRig, options: Any, progress: Any) -> None:
+        rig.safety.run()
+        rig.source.write(1.5)
+        rig.acquisition.read()
+        seen.append((live.state.stage, live.state.drive_v))
+        live.stop("STOP was pressed")
+        seen.append((live.state.stage, live.state.drive_v))
+
+    monkeypatch.setattr(study_player, "run_study", computing)
+    live.step()
+    assert seen == [("running", 1.5), ("tripped", 0.0)]
+
+
 def test_the_typed_limit_is_that_of_every_output_of_a_study(
     bench: tuple[LiveBench, GuardedRig], monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -119,9 +138,13 @@ def test_the_typed_limit_is_that_of_every_output_of_a_study(
         raise SafetyError("enough")
 
     monkeypatch.setattr(study_player, "run_study", playing)
-    monkeypatch.setattr(live, "_limit_v", 1.25)
     live.step()
-    assert high == [(1.25, 1.25)]
+    monkeypatch.setattr(StudyJob, "highest_v", lambda self, rig: 1.25)
+    number = live.do("request", "page", {})["number"]
+    study = {"study": "reference study", "experiments": ["triangle"]}
+    live.do("arm", "page", {"number": number, "limit_v": 1.25, "study": study})
+    live.step()
+    assert high == [(LIMIT_V, LIMIT_V), (1.25, 1.25)]
     assert live.state.high_v == 2.0, "the next run has the limits of the rig"
     assert "enough" in live.state.reason
 
@@ -418,11 +441,14 @@ def test_a_strain_at_a_limit_as_the_page_shows_it_is_accepted(
 
 
 def test_a_limit_of_the_board_that_was_not_narrowed_keeps_its_source() -> None:
-    board = Limits("drive", 0.0, 2.0, "V", low_source="rig.toml", high_source="rig.toml")
-    found = study_player._within(board, 1.5)
-    assert (found.low, found.high, found.low_source) == (0.0, 1.5, "rig.toml")
+    rig = guard(make_twin(twin_of_reading("hz"), 1))
+    whole = rig.description.drive_limits
+    rig.limit_drive(1.5, "the limit typed on the page")
+    found = rig.description.drive_limits
+    assert (found.low, found.high, found.low_source) == (0.0, 1.5, whole.low_source)
     assert found.high_source == "the limit typed on the page"
-    assert study_player._within(board, 2.0) == board
+    rig.limit_drive(2.0, "the limit typed on the page")
+    assert rig.description.drive_limits == rig.plain.description.drive_limits == whole
 
 
 @pytest.mark.parametrize("is_there", [True, False])
@@ -437,5 +463,5 @@ def test_a_study_names_its_recording_only_if_it_is_still_there(
     rig: Any = SimpleNamespace(safety=SimpleNamespace(live=False, record_with=lambda note: None))
     study = ArmedStudy(rig, PageLeases(1.0), cast(Any, SimpleNamespace(play=play)))
     job: Any = SimpleNamespace(options=SimpleNamespace(folder=tmp_path))
-    said = study.play(job, 1.0, None)
+    said = study.play(job, None)
     assert said == "A disk." + f" The data recorded so far are in {tmp_path}." * is_there

@@ -4,6 +4,7 @@ import asyncio
 import json
 import os
 import re
+import shlex
 import signal
 import subprocess
 import sys
@@ -421,16 +422,48 @@ def test_the_list_says_how_a_recording_ended_without_names_of_classes(
     assert found["state"].startswith(shown) and found["open"] is is_open
 
 
+def test_a_changed_manifest_is_read_again_and_a_command_can_be_pasted(files: PanelFiles) -> None:
+    recording(files, "it's a", {})
+    path = files.runs / "it's a" / "manifest.json"
+    path.write_text(json.dumps({"format": "haselab manifest 1", "state": "OPEN"}))
+    (found,) = listed(files, {})["recordings"]
+    assert shlex.split(found["state"].partition("run: ")[2])[2:] == [str(path.parent)]
+    path.write_text(json.dumps({"format": "haselab manifest 1", "state": "SEALED"}))
+    (found,) = listed(files, {})["recordings"]
+    assert not found["open"] and found["state"] == ""
+
+
 def test_a_note_stays_with_its_recording(files: PanelFiles) -> None:
     recording(files, "a", {})
-    note(files, {"name": "a", "text": "new shell\nno drift"})
+    note(files, {"name": "a", "text": "new shell\nno drift", "before": ""})
     (found,) = listed(files, {})["recordings"]
     assert found["note"] == "new shell\nno drift"
     assert re.search("manifest", found["state"]), "a folder without a manifest is listed as such"
     with pytest.raises(InputError, match="at most 10000 characters"):
         note(files, {"name": "a", "text": "x" * 10_001})
     with pytest.raises(InputError, match=r"no recording '\.\./a'"):
-        note(files, {"name": "../a", "text": ""})
+        note(files, {"name": "../a", "text": "", "before": ""})
+
+
+@pytest.mark.parametrize(
+    ("kept", "message"),
+    [
+        (b"of an editor", "has changed meanwhile"),
+        (b"\xff\xfe", "cannot be read, so it was not changed"),
+        (b"x" * 10_001, "has 10001 characters, but a page shows at most 10000"),
+    ],
+)
+def test_a_note_that_the_page_has_not_shown_is_not_overwritten(
+    files: PanelFiles, kept: bytes, message: str
+) -> None:
+    recording(files, "a", {})
+    path = files.runs / "a" / "notes.txt"
+    path.write_bytes(kept)
+    (shown,) = listed(files, {})["recordings"]
+    before = "" if kept == b"of an editor" else shown["note"]
+    with pytest.raises(InputError, match=message):
+        note(files, {"name": "a", "text": "new", "before": before})
+    assert path.read_bytes() == kept
 
 
 def test_an_analysis_that_fails_is_named_in_the_list(files: PanelFiles) -> None:

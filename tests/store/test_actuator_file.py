@@ -1,5 +1,9 @@
 """actuator.toml as a file: what a section's writer changes, and what it leaves alone."""
 
+import subprocess
+import sys
+import threading
+import time
 import tomllib
 from datetime import UTC, datetime
 
@@ -9,7 +13,9 @@ from hypothesis import strategies as st
 
 from haselab.base import InputError
 from haselab.models.actuator import ActuatorTables
+from haselab.store import actuator_file
 from haselab.store.actuator_file import Provenance, hashed, read_run, write_section
+from haselab.store.manifest import sha256_of
 from haselab.store.toml import validated
 
 TYPED = """\
@@ -163,3 +169,52 @@ def test_a_covariance_that_is_no_matrix_of_four_rows_is_refused(path, rows):
     path.write_text(f"[sensing.strain_map]\n{table}")
     with pytest.raises(InputError, match=r"covariance"):
         validated(ActuatorTables, read_run(path), path).strain_map()
+
+
+def test_only_one_of_two_simultaneous_writers_is_told_that_it_has_written(path, monkeypatch):
+    sha256, written, refused = sha256_of(path), [], []
+    replace = actuator_file.write_text
+
+    def slow(*given):
+        time.sleep(0.2)  # the other thread checks the file meanwhile
+        replace(*given)
+
+    monkeypatch.setattr(actuator_file, "write_text", slow)
+
+    def write(gain):
+        try:
+            write_section(path, "model", {"gain": gain}, None, sha256=sha256)
+            written.append(gain)
+        except InputError as error:
+            refused.append(str(error))
+
+    threads = [threading.Thread(target=write, args=(gain,)) for gain in (2.0, 3.0)]
+    for one in threads:
+        one.start()
+    for one in threads:
+        one.join()
+    assert len(written) == 1 and len(refused) == 1
+    assert "has changed since [model] was computed from it" in refused[0]
+    assert tomllib.loads(path.read_text())["model"]["gain"] == written[0]
+
+
+@pytest.mark.skipif(sys.platform == "win32", reason="Windows cannot replace a file that is open")
+def test_a_writer_waits_for_one_in_another_program(path, monkeypatch):
+    code = (
+        "import sys, pathlib\nfrom haselab.store.actuator_file import _sole_writer\n"
+        "with _sole_writer(pathlib.Path(sys.argv[1])):\n    print('has it', flush=True)\n"
+        "    sys.stdin.readline()\n"
+    )
+    command = [sys.executable, "-c", code, str(path)]
+    with subprocess.Popen(
+        command, stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True
+    ) as other:
+        assert other.stdout.readline() == "has it\n"
+        monkeypatch.setattr(actuator_file, "_WAIT_S", 0.05)
+        with pytest.raises(InputError, match="another program has written this file"):
+            write_section(path, "model", {"gain": 2.0}, None)
+        assert path.read_text() == TYPED
+        monkeypatch.setattr(actuator_file, "_WAIT_S", 60.0)
+        threading.Timer(0.1, other.stdin.close).start()
+        write_section(path, "model", {"gain": 2.0}, None)
+    assert tomllib.loads(path.read_text())["model"]["gain"] == 2.0

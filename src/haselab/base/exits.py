@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import contextlib
+import signal
+import threading
 from collections.abc import Iterator
 
 __all__ = ["SignalExit", "TooLongError", "exit_code_text", "no_exit"]
@@ -22,7 +24,8 @@ def no_exit() -> Iterator[None]:
 
     Exceptions that do not derive from `Exception` become an error, too, such as
     `asyncio.CancelledError` or a panic in an extension written in Rust. Ctrl-C still ends the
-    program.
+    program. Where it cannot be Ctrl-C, in another thread than the main one or in a program that
+    ignores SIGINT, a `KeyboardInterrupt` becomes an error as well.
 
     Raises:
         RuntimeError: The code called `sys.exit()` or raised such an exception.
@@ -40,10 +43,17 @@ def no_exit() -> Iterator[None]:
         raise
     except SystemExit as stop:
         raise RuntimeError(f"it called sys.exit({exit_code_text(stop)})") from stop
-    except (Exception, KeyboardInterrupt, GeneratorExit):
+    except (Exception, GeneratorExit):
         raise
     except BaseException as error:
+        if isinstance(error, KeyboardInterrupt) and _may_be_signal():
+            raise
         raise RuntimeError(f"it raised {type(error).__name__}") from error
+
+
+def _may_be_signal() -> bool:
+    is_main = threading.current_thread() is threading.main_thread()
+    return is_main and signal.getsignal(signal.SIGINT) is not signal.SIG_IGN
 
 
 def exit_code_text(stop: SystemExit) -> str:

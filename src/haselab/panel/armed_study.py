@@ -63,12 +63,11 @@ class ArmedStudy:
         if self.job is not None and self._rig.safety.live:
             self.player.require_wanted()
 
-    def play(self, job: StudyJob, limit_v: float, picture: PictureFile | None) -> str:
+    def play(self, job: StudyJob, picture: PictureFile | None) -> str:
         """Play the study. Meanwhile, pages can confirm a step, disarm, leave and renew leases.
 
         Args:
             job: the study.
-            limit_v: highest drive that was typed when the bench was armed, in V.
             picture: takes the last frame; None: no pictures.
         Returns:
             Why it has ended. After a fault of a disk or a driver the bench has tripped.
@@ -76,7 +75,7 @@ class ArmedStudy:
         folder, over = job.options.folder, threading.Event()
         threading.Thread(target=self._watch, args=(over,), daemon=True).start()
         try:
-            self.player.play(job, self._rig, limit_v, self.why_not, picture)
+            self.player.play(job, self._rig, self.why_not, picture)
             self.recorded = folder.name
         except HaselabError as error:
             is_kept = (folder / "session.h5").is_file()  # unless somebody has deleted it

@@ -47,6 +47,7 @@ _MOST_EVENTS = 40  # that a page shows
 _RECENT = ("arm", "drive", "loop", "open", "confirm")  # an old command could energise the bench
 _SHOWN_DIGITS = 5e-6  # a page shows the limits of the strain with six digits
 _REOPEN_S = 1.0  # between two attempts to open the board again
+_TYPED = "the limit typed on the page"
 _IDLE_BLOCKS = 20  # this many blocks in a row with an unexpected voltage trip the bench
 
 
@@ -130,10 +131,13 @@ class LiveBench:
             stage = Stage.TRIPPED
         low, high = about.drive_limits.low, about.drive_limits.high
         limits, job = None, self._study.job
+        drive_v, target_v = self._drive_v, self._target_v
+        if stage is Stage.TRIPPED and self._rig.bench.requested_v == 0.0:
+            drive_v = target_v = 0.0  # a study that computes has not ended yet
         if self._loop is not None:
             limits = (self._loop.saturation.low, self._loop.saturation.high)
         return BenchState(
-            stage.value, self._mode, self._drive_v, self._target_v, self._reference,
+            stage.value, self._mode, drive_v, target_v, self._reference,
             self._limit_v, self._holder, latched or self._reason, low, high,
             about.amplifier_gain, limits, about.name, self._rig.simulated, self._player.task,
             self._player.done, self._player.prompt, self._player.step, tuple(self._events),
@@ -231,8 +235,13 @@ class LiveBench:
             "output)."
         )
         if self._loop is not None:
-            highest_v = up_to_millivolts(self._loop_v())
-            manual += f" In closed loop: up to {highest_v} V at the amplifier's input."
+            limits = self._rig.description.drive_limits
+            with contextlib.suppress(LimitError):  # closing the loop says why it is not possible
+                highest_v = up_to_millivolts(self._loop.largest_v(limits.low, limits.high))
+                manual += (
+                    f" In closed loop: up to {highest_v} V at the amplifier's input. Neither "
+                    "exceeds the limit that you type."
+                )
         return {"number": self._request.number, "limits": f"{self._request.limits} {manual}",
                 "reason": self._request.reason}  # fmt: skip
 
@@ -296,6 +305,7 @@ class LiveBench:
         self._reason = ""
         self._leases.begin(holder)
         if job is not None:  # `step` plays it
+            self._rig.limit_drive(limit_v, _TYPED)
             self._mode, self._holder, self._limit_v = "study", holder, limit_v
             self._study.begin(holder, job)
             return {"folder": str(job.options.folder)}
@@ -311,6 +321,7 @@ class LiveBench:
         except BaseException:  # also a fault of a driver from another package
             self._end()
             raise
+        self._rig.limit_drive(limit_v, _TYPED)
         self._mode, self._holder, self._limit_v, self._reason = "drive", holder, limit_v, ""
         self._drive_v = self._target_v = 0.0
         self._leases.begin(holder)  # an instrument may have been slow
@@ -323,13 +334,6 @@ class LiveBench:
             raise SafetyError("The panel has ended. No command is carried out.")
         if self._holder and holder != self._holder and what not in ("disarm", "leave", "cancel"):
             raise SafetyError("Another page has armed the bench. It must disarm the bench first.")
-
-    def _loop_v(self) -> float:
-        """Highest drive of the closed loop, in V; of a contraction it is at the lower limit."""
-        assert self._loop is not None
-        limits = self._loop.saturation
-        ends = self._loop.voltage_map.voltage_v(np.array([limits.low, limits.high]))
-        return float(np.max(ends))
 
     def _find_request(self, values: JsonObject) -> ArmingRequest:
         if self._request is None or self._request.number != values.get("number"):
@@ -356,7 +360,7 @@ class LiveBench:
     def _drive_to(self, holder: str, values: JsonObject) -> JsonObject:
         self._require_armed(holder)
         target_v = number(values, "value_v")
-        low_v = max(self._rig.description.drive_limits.low, -self._limit_v)
+        low_v = self._rig.description.drive_limits.low
         if not low_v <= target_v <= self._limit_v:
             raise LimitError(
                 f"The requested drive is {target_v:g} V, but the bench was armed for {low_v:g} to "
@@ -381,18 +385,21 @@ class LiveBench:
                 f"The desired strain is {100.0 * strain:.6g} %, but the limits of the controller "
                 f"are {100.0 * limits.low:.6g} to {100.0 * limits.high:.6g} %. Choose another one."
             )
+        drive = self._rig.description.drive_limits
+        loop = self._loop.within(drive.low, drive.high)
         if self._closed is None:
-            highest_v = self._loop_v()
-            if highest_v > self._limit_v:
-                raise LimitError(
-                    f"The controller may use up to {up_to_millivolts(highest_v)} V, but the bench "
-                    f"was armed for {self._limit_v:g} V. Arm with a limit of at least that."
-                )
             carrier = (CARRIER_HZ, CARRIER_V)
-            self._closed = ClosedLoop(self._rig, _NoCamera(), carrier, self._loop, "panel")
+            self._closed = ClosedLoop(self._rig, _NoCamera(), carrier, loop, "panel")
             self._mode = "loop"
-        self._reference = min(max(strain, limits.low), limits.high)
-        return {}
+        self._reference = min(max(strain, loop.saturation.low), loop.saturation.high)
+        if abs(self._reference - strain) <= slack:
+            return {}
+        note = (
+            f"By the voltage map, a drive of {drive.low:g} to {drive.high:g} V reaches no strain "
+            f"of {100.0 * strain:.6g} %. The desired strain was limited to "
+            f"{100.0 * self._reference:.6g} %."
+        )
+        return {"note": note}
 
     def _open_loop(self, holder: str, values: JsonObject) -> JsonObject:
         self._require_armed(holder)
@@ -432,6 +439,7 @@ class LiveBench:
         except SafetyError as error:  # the latch keeps it
             self._reason = str(error)
         finally:
+            self._rig.limit_drive()
             self._rig.safety.end_run()
 
     # ---- of the thread that reads --------------------------------------------------------------
@@ -490,7 +498,7 @@ class LiveBench:
         self._lockin = lockin_of(self._rig.description, job.study.sensing.carrier_hz)
         reason = ""
         try:
-            reason = self._study.play(job, self._limit_v, self._picture)
+            reason = self._study.play(job, self._picture)
         finally:
             self._lockin = lockin_of(self._rig.description, CARRIER_HZ)
             with self._mutex:
@@ -546,7 +554,8 @@ class LiveBench:
 
     def _next_v(self) -> float:
         if self._closed is not None:
-            return min(self._closed.due_v(), self._limit_v)
+            limits = self._rig.description.drive_limits
+            return min(max(self._closed.due_v(), limits.low), limits.high)
         most_v = _RAMP_V_PER_S * self._rig.description.block_s
         return self._drive_v + min(max(self._target_v - self._drive_v, -most_v), most_v)
 

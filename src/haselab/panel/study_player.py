@@ -15,7 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 from PIL import Image
 
-from haselab.base import HaselabError, Limits
+from haselab.base import HaselabError
 from haselab.panel.pages.study_job import PageOperator, StudyJob
 from haselab.rig import Camera
 from haselab.rig.cameras.source import KnownCamera
@@ -118,14 +118,13 @@ class StudyPlayer:
         """Share of the study's time that has passed, 0 to 1."""
         return min(self._passed / self._total, 1.0) if self._total else 0.0
 
-    def play(self, job: StudyJob, rig: GuardedRig, limit_v: float, why_not: Callable[[], str],
+    def play(self, job: StudyJob, rig: GuardedRig, why_not: Callable[[], str],
              picture: PictureFile | None) -> None:  # fmt: skip
         """Play a study on an armed bench; the bench ends at 0 V.
 
         Args:
             job: the study.
             rig: the armed bench.
-            limit_v: highest drive that was typed when the bench was armed, in V.
             why_not: says why the study must end; empty while it may go on. It is asked for each
                 block.
             picture: takes the last frame; None: no pictures.
@@ -133,16 +132,13 @@ class StudyPlayer:
             HaselabError: see `run_study`; the recorded data are kept.
         """
         self._why_not, self._passed, self._total = why_not, 0.0, 0.0
-        full, played = rig.description, replace(rig)
-        narrowed = replace(full, drive_limits=_within(full.drive_limits, limit_v))
+        played = replace(rig)
         if picture is not None:
             played.camera = FilmedCamera(rig.camera, picture)
-        rig.plain.description = played.description = narrowed  # both are asked
         try:
             job.begin()
             run_study(job.study, played, job.options, self).require_complete()
         finally:
-            rig.plain.description = full
             self.task = self.prompt = ""
             self._why_not = lambda: ""
 
@@ -187,12 +183,3 @@ class StudyPlayer:
 
     def stop(self) -> None:
         """See `Progress`."""
-
-
-def _within(limits: Limits, limit_v: float) -> Limits:
-    typed = "the limit typed on the page"
-    if limit_v < limits.high:
-        limits = replace(limits, high=limit_v, high_source=typed)
-    if -limit_v > limits.low:
-        limits = replace(limits, low=-limit_v, low_source=typed)
-    return limits

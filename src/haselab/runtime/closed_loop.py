@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from collections import deque
+from dataclasses import replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -207,8 +208,11 @@ def setting_on_rig(rig: RigDescription, carrier_hz: float, loop: LoopSettings) -
 def _watchdog(rig: GuardedRig, carrier: tuple[float, float], loop: LoopSettings) -> LoopWatchdog:
     settings, by_video = rig.safety.settings, loop.video_zero_px is not None
     range_f = loop.strain_map.range_f or (0.0, 0.0)
+    about = rig.description
+    if rig.bench.whole is not None:  # what the amplifier withstands depends on the rig alone
+        about = replace(about, drive_limits=rig.bench.whole)
     model = loop_model(
-        rig.description,
+        about,
         loop.voltage_map,
         (loop.saturation.low, loop.saturation.high),
         (carrier[0], carrier[1] if loop.carrier_v is None else loop.carrier_v),

@@ -3,9 +3,11 @@
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
-from haselab.base import InputError, SafetyError, described, is_real, shown
+import numpy as np
+
+from haselab.base import InputError, LimitError, SafetyError, described, is_real, shown
 from haselab.base.exits import TooLongError, no_exit
 from haselab.control import Saturation
 from haselab.controllers import (
@@ -20,6 +22,8 @@ from haselab.models.maps import VoltageMap
 from haselab.runtime.call_limit import CallLimit
 
 __all__ = ["LoopSettings", "RunningController"]
+
+_REACH_POINTS = 1001  # strains at which the voltage map is checked
 
 
 @dataclass(frozen=True)
@@ -68,15 +72,58 @@ class LoopSettings:
         """
         low, high, start = self.saturation.low, self.saturation.high, 0.0
         if self.controller.kind.output == "voltage":
-            (low, high), known = drive_limits_v, self.actuator
-            if known is not None:
-                low, high = max(low, known.low_v), min(high, known.high_v)
+            low, high = self._voltages(drive_limits_v)
             start = float(self.voltage_map.voltage_v(self.saturation.start))
         found = ControllerSetting(
             period_s, low, high, start, delay_s, self.actuator, sensed_before_s
         )
         self.controller.kind.check(found)
         return found
+
+    def within(self, low_v: float, high_v: float) -> LoopSettings:
+        """Narrow the saturation to the strains whose voltage is within limits.
+
+        Args:
+            low_v: lowest voltage of the drive, in V.
+            high_v: highest one.
+        Returns:
+            The narrowed settings.
+        Raises:
+            LimitError: By the voltage map, no range of strains is within these limits.
+        """
+        ends = self.saturation.low, self.saturation.high
+        found = self.voltage_map.reach(ends, low_v, high_v)
+        if found is None or not found[0] < found[1]:
+            volts = self.voltage_map.voltage_v(ends)
+            raise LimitError(
+                f"By the voltage map, the strains of the controller ({100.0 * ends[0]:.6g} to "
+                f"{100.0 * ends[1]:.6g} %) need {volts.min():.4g} to {volts.max():.4g} V, but the "
+                f"drive is limited to {low_v:g} to {high_v:g} V. Change the limit of the drive, or "
+                "the limits of the controller."
+            )
+        return replace(self, saturation=Saturation(*found))
+
+    def largest_v(self, low_v: float, high_v: float) -> float:
+        """Largest drive, in magnitude, that the loop may put out.
+
+        Args:
+            low_v: lowest voltage of the drive, in V.
+            high_v: highest one.
+        Raises:
+            LimitError: See `within`.
+        """
+        limits = self.within(low_v, high_v).saturation
+        if self.controller.kind.output == "voltage":  # limited at each step, not by the map
+            return max(map(abs, self._voltages((low_v, high_v))))
+        strains = np.linspace(limits.low, limits.high, _REACH_POINTS)
+        return float(np.abs(self.voltage_map.voltage_v(strains)).max())
+
+    def _voltages(self, drive_limits_v: tuple[float, float]) -> tuple[float, float]:
+        """Limits of the rig that are also those of the actuator."""
+        (low, high), known = drive_limits_v, self.actuator
+        if known is not None:
+            low, high = max(low, known.low_v), min(high, known.high_v)
+        return low, high
 
 
 class RunningController:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+import math
 import time
 from collections.abc import Callable
 
@@ -64,6 +65,22 @@ class GuardedRig(Rig):
                     raise DeviceError(f"A link is lost: {found.unreachable}")
         self.bench.passed()
         self.deadlines.start()
+
+    def limit_drive(self, limit_v: float = math.inf, source: str = "") -> None:
+        """Check each drive also against plus and minus a voltage, until this is called again.
+
+        Args:
+            limit_v: largest drive in magnitude, in V; infinite: the limits of the rig apply again.
+            source: of this limit, for error messages.
+        """
+        whole = limits = self.bench.whole or self.description.drive_limits
+        if limit_v < limits.high:
+            limits = dataclasses.replace(limits, high=limit_v, high_source=source)
+        if -limit_v > limits.low:
+            limits = dataclasses.replace(limits, low=-limit_v, low_source=source)
+        self.bench.whole = None if limits == whole else whole
+        about = dataclasses.replace(self.description, drive_limits=limits)
+        self.description = self.plain.description = about  # both are asked
 
     def check_drive(self, drive_v: NDArray[np.float64]) -> None:
         """Refuse a whole drive before its first value is put out.

@@ -50,6 +50,7 @@ class GuardedBench:
     def __init__(self, rig: Rig, safety: Safety, clock: Callable[[], float]) -> None:
         s = safety.settings
         self.rig, self.safety = rig, safety
+        self.whole: Limits | None = None  # drive limits of the rig while narrower ones apply
         self.preloads = rig.source if isinstance(rig.source, PreloadsOutputs) else None
         self.watch = BlockWatch(rig.description, s)
         queued = rig.description.queued_blocks

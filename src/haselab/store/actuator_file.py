@@ -2,9 +2,13 @@
 
 from __future__ import annotations
 
+import contextlib
 import json
 import os
-from collections.abc import Collection, Mapping, Sequence
+import sys
+import threading
+import time
+from collections.abc import Collection, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from datetime import UTC, datetime
 from pathlib import Path
@@ -20,6 +24,9 @@ from haselab.store.manifest import sha256_of
 from haselab.store.text_file import read_text
 from haselab.store.toml import read_toml
 
+if sys.platform != "win32":
+    import fcntl
+
 __all__ = [
     "ACTUATOR",
     "Provenance",
@@ -32,6 +39,8 @@ __all__ = [
 ]
 
 ACTUATOR = "actuator.toml"
+_writing = threading.Lock()
+_WAIT_S, _POLL_S = 10.0, 0.01  # for another program that writes the file
 _WIDEST = 100  # characters of a list on one line
 
 
@@ -191,13 +200,54 @@ def write_section(
     if provenance is not None:
         origin = provenance.table()
         changes[f"provenance.{section}"] = (origin, list(origin))
-    text = _changed(read_text(path, "actuator file"), changes, path)
-    if sha256 and sha256_of(path) != sha256:
-        raise InputError(
-            f"Not written: the actuator file has changed since [{section}] was computed from it. "
-            f"Check what has changed, then write again. {path}"
-        )
-    write_text(path.resolve(), text)
+    with _sole_writer(path):
+        read_actuator(path)  # it may have changed meanwhile
+        text = _changed(read_text(path, "actuator file"), changes, path)
+        if sha256 and sha256_of(path) != sha256:
+            raise InputError(
+                f"Not written: the actuator file has changed since [{section}] was computed from "
+                f"it. Check what has changed, then write again. {path}"
+            )
+        write_text(path.resolve(), text)
+
+
+@contextlib.contextmanager
+def _sole_writer(path: Path) -> Iterator[None]:
+    """Keep other threads and programs from writing a file that is read, changed and replaced.
+
+    On Windows, only other threads: a file that is open cannot be replaced there.
+
+    Raises:
+        InputError: another program keeps the file.
+    """
+    end_s = time.monotonic() + _WAIT_S
+    with _writing, contextlib.ExitStack() as held:
+        while not _locked(path, held):
+            if time.monotonic() > end_s:
+                raise InputError(
+                    f"Not written: for {_WAIT_S:g} s, another program has written this file. End "
+                    f"that program, then write again. {path}"
+                )
+            time.sleep(_POLL_S)
+        yield
+
+
+def _locked(path: Path, held: contextlib.ExitStack) -> bool:
+    """Lock a file until the context ends; False while another program has locked it."""
+    if sys.platform == "win32":
+        return True
+    with contextlib.ExitStack() as opened:
+        file = opened.enter_context(path.open("rb"))
+        try:
+            fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
+        except BlockingIOError:
+            return False
+        except OSError:  # a file system without locks
+            return True
+        if not os.path.samestat(os.fstat(file.fileno()), path.stat()):
+            return False  # it was replaced before it was locked
+        held.push(opened.pop_all())
+        return True
 
 
 def write_sections(
@@ -213,11 +263,12 @@ def write_sections(
         InputError: the file cannot be read, or a section is not a table.
         DeviceError: the file cannot be written.
     """
-    if path.exists():
-        read_actuator(path)
-        start = read_text(path, "actuator file")
     changes = {name: (values, list(values)) for name, values in sections.items()}
-    write_text(path, _changed(start, changes, path))
+    with _sole_writer(path) if path.is_file() else contextlib.nullcontext():
+        if path.exists():
+            read_actuator(path)
+            start = read_text(path, "actuator file")
+        write_text(path, _changed(start, changes, path))
 
 
 def _changed(

@@ -23,6 +23,7 @@ from axe_playwright_python.sync_playwright import Axe
 from playwright.sync_api import Browser, Page, Route, expect
 
 from haselab.base import InputError
+from haselab.panel.pages import pick as page_module
 from haselab.panel.pages.pick import PICK_REQUESTS, Videos
 from haselab.rig.twin.camera import TwinCamera, TwinCameraConfig
 from haselab.store.video.writer import VideoWriter
@@ -568,7 +569,7 @@ def test_points_on_noise_alone_are_saved_and_named(tmp_path: Path) -> None:
 
 
 def test_an_existing_table_is_only_moved_when_that_is_requested(
-    video: Path, tmp_path: Path
+    video: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     out = tmp_path / "points.csv"
     out.write_text("mine")
@@ -578,6 +579,12 @@ def test_an_existing_table_is_only_moved_when_that_is_requested(
         asked(videos, "pick-save", **given)
     assert "--force" not in str(refused.value)
     assert out.read_text() == "mine"
+    with monkeypatch.context() as other:  # another page saves it after the check
+        seen = iter((False, True))
+        other.setattr(page_module, "is_occupied", lambda table: next(seen))
+        with pytest.raises(InputError, match="Type another name, or tick") as refused:
+            asked(videos, "pick-save", **given)
+    assert "--force" not in str(refused.value) and out.read_text() == "mine"
     asked(videos, "pick-save", move=True, **given)
     assert (tmp_path / "points.csv.previous-1").read_text() == "mine"
     assert table(out) == [{"point": 'a, "b"', "x_px": "155.500", "y_px": "60.000"}]

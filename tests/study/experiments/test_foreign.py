@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+import signal
 import sys
 from collections.abc import Mapping
+from concurrent.futures import ThreadPoolExecutor
 from types import SimpleNamespace
 from typing import Any
 
@@ -145,6 +147,22 @@ def test_a_right_result_is_returned_as_it_is() -> None:
 def test_a_signal_during_a_fit_still_ends_the_program(ends: BaseException) -> None:
     with pytest.raises(type(ends), match=r"143|^$"):
         outcome(ends)
+
+
+@pytest.mark.parametrize("where", ["thread", "ignored signal"])
+def test_a_keyboard_interrupt_that_nobody_pressed_is_an_error(where: str) -> None:
+    """As in the processes of the panel, which would end with it."""
+    said = r"'fit' of the experiment \[own\].*it raised KeyboardInterrupt"
+    if where == "thread":
+        with ThreadPoolExecutor(1) as pool, pytest.raises(ResultError, match=said):
+            pool.submit(outcome, KeyboardInterrupt()).result()
+        return
+    former = signal.signal(signal.SIGINT, signal.SIG_IGN)
+    try:
+        with pytest.raises(ResultError, match=said):
+            outcome(KeyboardInterrupt())
+    finally:
+        signal.signal(signal.SIGINT, former)
 
 
 def test_an_experiment_that_exits_while_it_plays_is_named(monkeypatch: Any) -> None:

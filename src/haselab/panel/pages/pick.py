@@ -351,14 +351,20 @@ def _save(videos: Videos, values: JsonObject) -> JsonObject:
     table = videos.table(name, str(values.get("table") or ""))
     text = points_table(points, frame, table)
     scale = _scale(videos, values)
+    refused = InputError(
+        f"This file exists already; it was not changed: {table}. Type another name, or tick 'Move "
+        "an existing file to NAME.previous-1'."
+    )
     if is_occupied(table):
         if values.get("move") is not True:
-            raise InputError(
-                f"This file exists already; it was not changed: {table}. Type another name, or "
-                "tick 'Move an existing file to NAME.previous-1'."
-            )
+            raise refused
         move_aside(table)
-    write_new(table, text)
+    try:
+        write_new(table, text)
+    except InputError:
+        if is_occupied(table):  # another page has just saved it
+            raise refused from None
+        raise
     lost = _lost(path, stamp, points, frame)
     ruler = _ruler(values)
     words = ["haselab", "track", str(path), "--points", str(table)]

@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+import functools
 import json
 import math
+import shlex
 import subprocess
 import sys
 import threading
@@ -13,7 +15,7 @@ from typing import Any
 from haselab.base import InputError, JsonObject, is_real, shown
 from haselab.panel.files import PanelFiles
 from haselab.store.folder import write_text
-from haselab.store.manifest import read_manifest, recorded_when
+from haselab.store.manifest import MANIFEST, read_manifest, recorded_when
 from haselab.store.text_file import read_text
 
 __all__ = ["analyse", "analyse_recorded", "compare", "listed", "note", "report"]
@@ -22,7 +24,7 @@ _NOTES, _LOG = "notes.txt", "analysis.log"
 _MOST_LETTERS = 10_000
 _MOST_FOLDERS = 2000
 _running: dict[Path, subprocess.Popen[bytes]] = {}  # analyses by folder
-_starting = threading.Lock()
+_starting, _noting = threading.Lock(), threading.Lock()
 
 
 def _recording(files: PanelFiles, name: object) -> Path:
@@ -70,16 +72,34 @@ def listed(files: PanelFiles, values: JsonObject) -> JsonObject:
 
 def _described(folder: Path) -> dict[str, Any]:
     try:
+        about = (folder / MANIFEST).stat()
+        version = about.st_mtime_ns, about.st_size, about.st_ino
+    except OSError:
+        version = 0, 0, 0
+    running = _running.get(folder)
+    return {
+        **_of_manifest(folder, version),
+        "note": _read(folder / _NOTES),
+        "analysing": running is not None and running.poll() is None,
+        "problem": " ".join(_read(folder / _LOG).split()) if running and running.poll() else "",
+        "report": (folder / "report.html").is_file(),
+    }
+
+
+@functools.lru_cache(2 * _MOST_FOLDERS)
+def _of_manifest(folder: Path, version: tuple[int, int, int]) -> dict[str, Any]:
+    """What the manifest says; `version` is that of its file, which takes a millisecond to read."""
+    try:
         manifest = read_manifest(folder)
     except InputError as error:
         manifest, state = {}, " ".join(str(error).split())
     else:
         state = _ended(str(manifest.get("ended", "")))
         if manifest.get("state") == "OPEN":
-            state = f"Not closed. If no program records it, run: haselab recover {folder}"
+            command = f"haselab recover {shlex.quote(str(folder))}"
+            state = f"Not closed. If no program records it, run: {command}"
         elif manifest.get("state") == "RECOVERED":
             state = f"{state}, recovered".lstrip(", ")
-    running = _running.get(folder)
     study, when = manifest.get("study"), recorded_when(manifest) if manifest else {}
     return {
         "name": folder.name,
@@ -88,10 +108,6 @@ def _described(folder: Path) -> dict[str, Any]:
         "seconds": when.get("duration_s"),
         "state": state,
         "open": manifest.get("state") == "OPEN",
-        "note": _read(folder / _NOTES),
-        "analysing": running is not None and running.poll() is None,
-        "problem": " ".join(_read(folder / _LOG).split()) if running and running.poll() else "",
-        "report": (folder / "report.html").is_file(),
     }
 
 
@@ -115,18 +131,36 @@ def note(files: PanelFiles, values: JsonObject) -> JsonObject:
 
     Args:
         files: of the panel.
-        values: `name` of the recording and `text` of the note.
+        values: `name` of the recording, `text` of the note, and `before`, the note that is
+            replaced.
     Returns:
         An empty object.
     Raises:
-        InputError: there is no such recording, or the note is no text or too long.
+        InputError: there is no such recording, the note is no text or too long, or it is not
+            `before` that would be replaced.
     """
     folder, text = _recording(files, values.get("name")), values.get("text")
     if not isinstance(text, str) or len(text) > _MOST_LETTERS or not _is_text(text + " "):
         raise InputError(
             f"A note must be a text of at most {_MOST_LETTERS} characters. Shorten it."
         )
-    write_text(folder / _NOTES, text)
+    with _noting:
+        path = folder / _NOTES
+        try:
+            now = path.read_text(encoding="utf-8") if path.exists() else ""
+        except (OSError, ValueError) as error:
+            raise InputError(
+                f"The note cannot be read, so it was not changed: {error}. Use an editor. {path}"
+            ) from None
+        if now != values.get("before"):
+            raise InputError(
+                f"Not saved: the note about {folder.name} has changed meanwhile. Read it, then "
+                "save again."
+                if len(now) <= _MOST_LETTERS
+                else f"Not saved: the note has {len(now)} characters, but a page shows at most "
+                f"{_MOST_LETTERS}. Use an editor. {path}"
+            )
+        write_text(path, text)
     return {}
 
 

@@ -56,7 +56,7 @@ function Slider({ name, unit, low, high, step, value, send, about }) {
   const [typed, type] = useState(null); // while it is being typed
   const [sent, setSent] = useState(null); // until the bench has it
   useEffect(() => setSent(null), [value]);
-  const put = (text) => { setSent(text); send(Number(text)).then((found) => { if (found.error) setSent(null); }); };
+  const put = (text) => { setSent(text); send(Number(text)).then((found) => { if (found.error || found.answer?.note) setSent(null); }); };
   const now = sent ?? String(Number(value.toPrecision(6)));
   const commit = () => { if (typed !== null && typed !== "") put(typed); type(null); };
   return html`<label>${name}, in ${unit}${about ? `: ${about}` : ""}
@@ -67,10 +67,12 @@ function Slider({ name, unit, low, high, step, value, send, about }) {
 }
 
 function Live({ state, say }) {
-  const ask = (what, values) => link.ask(what, values).then((found) => { say(found.error || ""); return found; });
+  const [note, setNote] = useState(""); // about the last command
+  const ask = (what, values) => link.ask(what, values).then((found) => { say(found.error || ""); setNote(found.answer?.note ?? ""); return found; });
   const low = Math.max(state.low_v, -state.limit_v);
   if (state.mode === "study") return html`<${Playing} state=${state} link=${link} say=${say} />`;
   return html`
+    ${note && html`<p role="status">${note}</p>`}
     <p class="badge live">Armed by this page up to ${kilo(state.limit_v, state.gain)}</p>
     <${Slider} name="Drive" unit="V" low=${low} high=${state.limit_v} step="0.01" value=${state.target_v}
       about=${`now ${kilo(state.drive_v, state.gain)}, ${state.mode === "loop" ? "set by the controller" : `changes by 1 V/s (${Number((state.gain / 1000).toPrecision(3))} kV/s at the output)`}`} send=${(v) => ask("drive", { value_v: v })} />

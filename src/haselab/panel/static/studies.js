@@ -1,9 +1,10 @@
 // Choose, check and play a study; the list of recordings.
-import { html, useState, useEffect } from "/static/vendor/htm-preact.js";
+import { html, useState, useEffect, useMemo } from "/static/vendor/htm-preact.js";
 import { Arming, Playing, Progress, kilo } from "/static/bench.js";
 
 const number = (v) => (v === null || v === undefined ? "" : Number(v.toPrecision(5)));
-const local = (time) => (time ? new Date(time).toLocaleString("sv-SE") : ""); // as in the names of the folders
+const clock = new Intl.DateTimeFormat("sv-SE", { dateStyle: "short", timeStyle: "medium" }); // as in the names of the folders
+const local = (time) => (Number.isNaN(Date.parse(time)) ? "" : clock.format(new Date(time)));
 const when = (s) => (s === null ? "unknown" : s < 120 ? `${Math.round(s)} s` : `${Math.round(s / 60)} min`);
 
 let remembered = null; // the choice, while another page of the panel is shown
@@ -76,15 +77,44 @@ function Comparison({ link, names, close }) {
       <td class=${Math.abs(one.deviations) > 3 ? "error" : ""}>${one.deviations === null ? "–" : one.deviations.toFixed(1)}</td></tr>`)}</tbody></table></div>`;
 }
 
-function Recordings({ link, state }) {
+const drafts = new Map(); // notes that are typed and not saved, by recording, with the note that was shown before
+
+// A note about a recording. Only what somebody typed is saved, and only over the note that they saw.
+function Note({ name, saved, keep }) {
+  const [draft, set] = useState(drafts.get(name) ?? null);
+  const change = (next) => { if (next === null) drafts.delete(name); else drafts.set(name, next); set(next); };
+  const type = (text) => change({ text, before: draft === null ? saved : draft.before });
+  const differs = draft !== null && draft.before !== saved && draft.text !== saved;
+  async function save(before) {
+    const sent = draft.text;
+    if (sent !== before && !(await keep(name, sent, before))) return;
+    if (drafts.get(name)?.text === sent) change(null); // nobody typed meanwhile
+    else change({ ...drafts.get(name), before: sent });
+  }
+  return html`<textarea aria-label=${`Note about ${name}`} rows="2" value=${draft === null ? saved : draft.text} onInput=${(e) => type(e.target.value)}
+      onBlur=${() => draft !== null && !differs && save(saved)}></textarea>
+    ${differs && html`<p class="error" role="alert">Not saved: meanwhile, the note was changed to “${saved}”.</p>
+      <div class="row"><button type="button" onClick=${() => save(saved)}>Save what I typed instead</button>
+        <button type="button" onClick=${() => change(null)}>Discard what I typed</button></div>`}`;
+}
+
+const MOST_ROWS = 100; // more are drawn on request: thousands would block the page, and the bench would be lost
+
+function Recordings({ link, mode, recording }) {
+  const [most, setMost] = useState(MOST_ROWS);
   const [found, see] = useState({ folder: "", recordings: [] });
   const [search, setSearch] = useState("");
   const [marked, mark] = useState([]);
   const [compared, setCompared] = useState(null);
   const [error, say] = useState("");
   const read = () => link.request("recordings").then((list) => (list.error ? say(list.error) : see(list)));
-  useEffect(() => { read(); const timer = setInterval(read, 3000); return () => clearInterval(timer); }, []);
-  useEffect(() => { read(); }, [state?.mode]);
+  useEffect(() => {
+    let timer = null, over = false;
+    const repeat = async () => { await read(); if (!over) timer = setTimeout(repeat, 3000); }; // one request at a time
+    repeat();
+    return () => { over = true; clearTimeout(timer); };
+  }, []);
+  useEffect(() => { if (mode !== undefined) read(); }, [mode]);
   async function open(name) {
     const page = window.open("", "_blank"); // at once: a later one would be blocked as a pop-up
     const answer = await link.request("report", { name });
@@ -97,9 +127,14 @@ function Recordings({ link, state }) {
     say(answer.error || "");
     read();
   }
-  const keep = (name, text) => link.request("note", { name, text }).then((answer) => say(answer.error || ""));
+  async function keep(name, text, before) {
+    const answer = await link.request("note", { name, text, before });
+    await read();
+    say(answer.error || "");
+    return !answer.error;
+  }
   const wanted = search.toLowerCase().split(/\s+/).filter(Boolean);
-  const shown = found.recordings.filter((one) => {
+  const all = wanted.length === 0 ? found.recordings : found.recordings.filter((one) => {
     const text = `${one.name} ${one.study} ${local(one.opened)} ${one.state} ${one.note}`.toLowerCase();
     return wanted.every((word) => text.includes(word));
   });
@@ -111,15 +146,19 @@ function Recordings({ link, state }) {
     <label>Search <input type="search" value=${search} onInput=${(e) => setSearch(e.target.value)} /></label>
     <div class="row"><button type="button" disabled=${marked.length !== 2} onClick=${() => setCompared(marked)}>Compare the two that are marked</button></div>
     <table><thead><tr><th scope="col">Mark</th><th scope="col">Recording</th><th scope="col">Study</th><th scope="col">Ended</th><th scope="col">Note</th><th scope="col">Results</th></tr></thead>
-    <tbody>${shown.map((one) => html`<tr key=${one.name}>
+    <tbody>${all.slice(0, most).map((one) => html`<tr key=${one.name}>
       <td><input type="checkbox" aria-label=${`Mark ${one.name}`} checked=${marked.includes(one.name)} onChange=${(e) => toggle(one.name, e.target.checked)} /></td>
-      <td>${one.name}<br /><small>${local(one.opened)}</small></td><td>${one.study}</td><td>${one.name === state?.recording ? "being recorded" : one.state}</td>
-      <td><textarea aria-label=${`Note about ${one.name}`} rows="2" defaultValue=${one.note} onBlur=${(e) => e.target.value !== one.note && keep(one.name, e.target.value)}></textarea></td>
+      <td>${one.name}<br /><small>${local(one.opened)}</small></td><td>${one.study}</td><td>${one.name === recording ? "being recorded" : one.state}</td>
+      <td><${Note} name=${one.name} saved=${one.note} keep=${keep} /></td>
       <td>${one.report ? html`<button type="button" onClick=${() => open(one.name)}>Report</button>` : ""}
         <button type="button" disabled=${one.analysing || one.open} onClick=${() => analyse(one.name)}>${one.analysing ? "Analysing …" : "Analyse"}</button>
-        ${one.problem && html`<p class="error">${one.problem}</p>`}</td></tr>`)}</tbody></table></div>`;
+        ${one.problem && html`<p class="error">${one.problem}</p>`}</td></tr>`)}</tbody></table>
+    ${all.length > most && html`<p>The newest ${most} of ${all.length} are shown.</p><button type="button" onClick=${() => setMost(most + MOST_ROWS)}>Show more</button>`}</div>`;
 }
 
 export default function Studies({ link, state, mine }) {
-  return html`<${Chooser} link=${link} state=${state} mine=${mine} /><${Recordings} link=${link} state=${state} />`;
+  const mode = state?.mode, recording = state?.recording;
+  // The panel draws its pages with every frame of data, but the list does not depend on it.
+  const list = useMemo(() => html`<${Recordings} link=${link} mode=${mode} recording=${recording} />`, [link, mode, recording]);
+  return html`<${Chooser} link=${link} state=${state} mine=${mine} />${list}`;
 }

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import io
+import math
 import os
 import shutil
 import sys
@@ -234,9 +235,9 @@ class SessionWriter:
             raise self._failed(error) from None
         if free < _RESERVE_BYTES:
             raise DeviceError(
-                f"The disk is full: {free / 1e6:.0f} MB are left, {_RESERVE_BYTES / 1e6:.0f} MB "
-                "are needed. The recorded data are kept. Free disk space, or choose another "
-                f"folder. {self._path}"
+                f"The disk is full: {math.floor(free / 1e5) / 10:g} MB are left, "
+                f"{_RESERVE_BYTES / 1e6:.0f} MB are needed. The recorded data are kept. Free disk "
+                f"space, or choose another folder. {self._path}"
             )
 
     def _put(self, job: Callable[[], None], *, always: bool = False) -> None:

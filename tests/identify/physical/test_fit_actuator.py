@@ -23,7 +23,7 @@ from haselab.identify.physical import MotionRecord, fit_actuator
 from haselab.identify.physical.misfit import SHARED_PX, TRACKED_ZERO_M, Misfit, SharedErrors
 from haselab.identify.physical.model_error import excess_energy, hidden_std, widen_std
 from haselab.identify.physical.plausible import find_implausible
-from haselab.identify.physical.residuals import notes_of
+from haselab.identify.physical.residuals import ChannelResiduals, notes_of
 from haselab.identify.physical.result import result_of
 from haselab.identify.physical.search import SearchResult
 from haselab.identify.physical.unknowns import Unknowns, fitted_parameters
@@ -218,10 +218,12 @@ def test_lengths_alone_have_a_note_on_what_they_do_not_show():
 
 def test_a_monitor_that_contradicts_the_stated_voltage_is_named():
     seen = replace(record(TRUE, 4, duration_s=5.0), voltage_ratio=0.98)
-    (note,) = notes_of(0.0, [seen])
+    parts = np.random.default_rng(1).standard_normal((2, 500))
+    white = ChannelResiduals([parts[0]], [parts[1]], 1.0)
+    (note,) = notes_of(0.0, white, [seen])
     assert note.startswith("record-4: the voltage by the monitor is 0.98 times drive times gain")
-    assert notes_of(0.0, [replace(seen, voltage_ratio=0.995)]) == ()
-    assert notes_of(0.0, [replace(seen, voltage_ratio=math.nan)]) == ()
+    assert notes_of(0.0, white, [replace(seen, voltage_ratio=0.995)]) == ()
+    assert notes_of(0.0, white, [replace(seen, voltage_ratio=math.nan)]) == ()
     fault = find_implausible(TRUE, [replace(seen, voltage_ratio=0.9)])
     assert fault.startswith("record-4: the voltage by the monitor is 0.9 times drive times gain")
 

@@ -35,6 +35,7 @@ class StepNumbers:
         peak_excess: largest excess over the reference, relative to the reference's step, including
             ringing; 0 if the response stays below. It compares responses that end at different
             values, as in open loop, where the overshoot over a value raised by creep is small.
+        ringing: largest value less that with the ringing averaged out, relative to the final value.
     """
 
     rise_time_s: float
@@ -44,16 +45,16 @@ class StepNumbers:
     settling_time_s: float
     steady_state_error: float
     peak_excess: float
+    ringing: float
 
     @property
     def remark(self) -> str:
         """Why the rise time is not well defined; empty if it is."""
-        rings = self.overshoot - self.ring_averaged_overshoot
-        if rings <= _RINGS:
+        if not self.ringing > _RINGS:
             return ""
         return (
-            f"the step response rings by {100.0 * rings:.0f} % of the step, so its rise time with "
-            "the ringing averaged out is not well defined"
+            f"the step response rings by {100.0 * self.ringing:.0f} % of the step, so its rise time "
+            "with the ringing averaged out is not well defined"
         )
 
 
@@ -201,6 +202,7 @@ def step_numbers(
         settling_time_s=settled / rate_hz if settled < moved.size - last.size else math.nan,
         steady_state_error=(wanted - final) / size,
         peak_excess=max(0.0, (float(clean.max()) - wanted) / size),
+        ringing=float(clean.max() - averaged.max()) / final,
     )
 
 

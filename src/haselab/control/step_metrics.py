@@ -53,8 +53,8 @@ class StepNumbers:
         if not self.ringing > _RINGS:
             return ""
         return (
-            f"the step response rings by {100.0 * self.ringing:.0f} % of the step, so its rise time "
-            "with the ringing averaged out is not well defined"
+            f"the step response rings by {100.0 * self.ringing:.0f} % of the step, so its rise "
+            "time with the ringing averaged out is not well defined"
         )
 
 

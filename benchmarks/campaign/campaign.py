@@ -4,23 +4,26 @@
 
 A case identifies a virtual device: parameters drawn, its record simulated in C and fitted. T1 is
 the time of one process. All times include the start of the workers, except for a running scheduler,
-whose two workers wait for the command, as on a cluster. With --repeats, the shortest time of each
-kind of campaign counts, because the speed of a shared computer changes within minutes.
+whose two workers wait for the command, as on a cluster. The speed of a shared computer changes
+within minutes: T1 is measured before and after each campaign of two workers and its mean counts.
+With --repeats, the median of the ratios counts.
 """
 
 from __future__ import annotations
 
 import argparse
 import contextlib
+import itertools
 import os
 import pickle
 import resource
+import statistics
 import subprocess
 import sys
 import tempfile
 import time
 from collections.abc import Callable, Iterator
-from dataclasses import dataclass
+from dataclasses import astuple, dataclass
 from pathlib import Path
 
 from distributed import Client
@@ -39,6 +42,11 @@ from haselab.store.campaign.shards import CaseRow, Shards
 CASES = 10_000
 FINISHED = 100_000
 _GOAL = 0.9  # of T1 / (N TN), for all CASES
+_WORKERS = {
+    "running": "2 workers of a running Dask scheduler",
+    "two": "2 processes",
+    "dask": "2 Dask workers",
+}
 CAMPAIGN = """
 name = "quick virtual devices"
 kind = "transfer"
@@ -98,6 +106,11 @@ class _Times:
     own_s: float
     workers_s: float
 
+    def mean(self, other: _Times) -> _Times:
+        """Return the mean of two campaigns."""
+        pairs = zip(astuple(self), astuple(other), strict=True)
+        return _Times(*(0.5 * (a + b) for a, b in pairs))
+
 
 @contextlib.contextmanager
 def _running_cluster(folder: Path) -> Iterator[str]:
@@ -141,18 +154,27 @@ def _children_s() -> float:
     return used.ru_utime + used.ru_stime
 
 
-def _measured(plan: Plan, folder: Path) -> dict[str, _Times]:
-    """One campaign each by one process, two processes, a local and a running cluster."""
-    found = {
-        "one": _timed(plan, folder / "one", lambda problem: ProcessExecutor(problem, 1)),
-        "two": _timed(plan, folder / "two", lambda problem: ProcessExecutor(problem, 2)),
-        "dask": _timed(plan, folder / "dask", lambda problem: DaskExecutor(problem, LOCAL, 2)),
-    }
+def _measured(plan: Plan, folder: Path) -> dict[str, tuple[_Times, _Times]]:
+    """Campaigns by two processes, a local and a running cluster, each with one by one process."""
+    ones: list[_Times] = []
+
+    def one_process() -> None:
+        out = folder / f"one-{len(ones)}"
+        ones.append(_timed(plan, out, lambda problem: ProcessExecutor(problem, 1)))
+
+    one_process()
+    two = _timed(plan, folder / "two", lambda problem: ProcessExecutor(problem, 2))
+    one_process()
+    dask = _timed(plan, folder / "dask", lambda problem: DaskExecutor(problem, LOCAL, 2))
+    one_process()
     with _running_cluster(folder) as address:
-        found["running"] = _timed(
+        running = _timed(
             plan, folder / "running", lambda problem: DaskExecutor(problem, address, 2)
         )
-    return found
+    one_process()
+    found = {"two": two, "dask": dask, "running": running}
+    around = [before.mean(after) for before, after in itertools.pairwise(ones)]
+    return {name: (one, times) for one, (name, times) in zip(around, found.items(), strict=True)}
 
 
 def rows(cases: int = CASES, finished: int = FINISHED, repeats: int = 1) -> Iterator[Row]:
@@ -171,18 +193,14 @@ def rows(cases: int = CASES, finished: int = FINISHED, repeats: int = 1) -> Iter
             folder = Path(name) / f"round-{number}"
             folder.mkdir()
             rounds.append(_measured(plan, folder))
-        one, two, dask, running = (
-            min((found[which] for found in rounds), key=lambda times: times.wall_s)
-            for which in ("one", "two", "dask", "running")
-        )
+        one, two = rounds[0]["two"]
         about = f"{cases:,} devices, {1e3 * one.wall_s / cases:.2g} ms each"
         load = f"load average {os.getloadavg()[0]:.1f} on {os.cpu_count()} cores"
-        share = one.wall_s / (2.0 * running.wall_s)
-        yield Row("T1 / (2 T2), 2 workers of a running Dask scheduler", share, "", goal)
-        for what, found in (("2 processes", two), ("2 Dask workers", dask)):
-            share = one.wall_s / (2.0 * found.wall_s)
+        for name, what in _WORKERS.items():
+            pairs = [found[name] for found in rounds]
+            share = statistics.median(one.wall_s / (2.0 * both.wall_s) for one, both in pairs)
             yield Row(f"T1 / (2 T2), {what}", share, "", goal, note=f"{about}, {load}")
-            own_s = 1e3 * found.own_s / cases
+            own_s = statistics.median(1e3 * both.own_s / cases for _, both in pairs)
             yield Row(f" of this program, {what}", own_s, "ms/case")
         # The time of all processes together does not depend on other programs on the computer.
         share = one.workers_s / (two.own_s + two.workers_s)

@@ -269,7 +269,7 @@ def test_steps_without_a_plant_are_played_in_open_loop_alone(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     steps = {"step": 0.04, "zero_s": 6.0, "step_s": 8.0, "rest_s": 20.0, "frame_rate_hz": 20.0,
-             "open_trials": 1, "pi_trials": 0, "pid_trials": 0}  # fmt: skip
+             "open_trials": 1, "pi_trials": 1, "pid_trials": 0}  # fmt: skip
     lines = [f"{key} = {value}" for key, value in steps.items()]
     text = 'name = "open loop"\n[steps]\n' + "\n".join(lines) + TRIANGLE
     (tmp_path / "study.toml").write_text(text)
@@ -284,6 +284,7 @@ def test_steps_without_a_plant_are_played_in_open_loop_alone(
     assert "S24.rise_closed" not in found
     reasons = {key: item["reason"] for item in results["not_played"] for key in item["ids"]}
     assert "needs [control]" in reasons["S24.rise_closed"]
+    assert reasons["S25.rise_pid"] == "steps.pid_trials is 0 in this study."
 
 
 def test_the_experiments_know_how_long_the_study_takes(recorded: Any) -> None:

@@ -122,6 +122,7 @@ class DaskExecutor:
         limit_s: time of a case, after which it is stopped; None: no limit.
     Raises:
         InputError: Dask is not installed, or there is no scheduler at the address.
+        DeviceError: the local cluster does not start.
     """
 
     def __init__(
@@ -145,6 +146,11 @@ class DaskExecutor:
             )
         except (OSError, ValueError, RuntimeError) as error:
             self._close_cluster()
+            if address == LOCAL:
+                raise DeviceError(
+                    f"Dask could not start its workers on this computer ({text_of(error)}). A "
+                    "script that computes cases with Dask needs if __name__ == '__main__'."
+                ) from None
             raise InputError(
                 f"No Dask scheduler answers at {address} ({text_of(error)}). Start one with 'dask "
                 "scheduler', or check the address."

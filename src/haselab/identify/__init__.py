@@ -31,7 +31,8 @@ from haselab.identify.nonlinear.nonlinear_fit import NonlinearFit
 from haselab.identify.nonlinear.oscillator import fit_duffing, fit_output_curve
 from haselab.identify.prediction import predict
 from haselab.identify.record import Record
-from haselab.identify.sampled.arx import ArxFit, ArxOrders, fit_arx
+from haselab.identify.sampled.arx import ArxFit, fit_arx
+from haselab.identify.sampled.arx_equation import ArxOrders
 from haselab.identify.sampled.subspace import SubspaceFit, fit_subspace
 from haselab.identify.statics.capacitance_map import CapacitanceMapFit, fit_capacitance_map
 from haselab.identify.statics.hyperelastic import (

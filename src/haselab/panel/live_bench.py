@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import contextlib
-import math
 import threading
 import time
 from collections import deque
@@ -26,12 +25,12 @@ from haselab.base import (
 from haselab.panel.armed_study import CHECK, ArmedStudy
 from haselab.panel.bench_state import BenchState
 from haselab.panel.columns import LiveWriter
+from haselab.panel.live_signals import IdleWatch, LiveSignals
 from haselab.panel.page_leases import PageLeases
 from haselab.panel.pages.study_job import StudyJob
 from haselab.panel.pages.values import number, up_to_millivolts
 from haselab.panel.study_player import PictureFile, StudyPlayer
 from haselab.runtime.closed_loop import ClosedLoop
-from haselab.runtime.lockin import lockin_of
 from haselab.runtime.loop import LoopSettings
 from haselab.runtime.observer import Seen
 from haselab.safety.guarded import GuardedRig
@@ -48,7 +47,6 @@ _RECENT = ("arm", "drive", "loop", "open", "confirm")  # an old command could en
 _SHOWN_DIGITS = 5e-6  # a page shows the limits of the strain with six digits
 _REOPEN_S = 1.0  # between two attempts to open the board again
 _TYPED = "the limit typed on the page"
-_IDLE_BLOCKS = 20  # this many blocks in a row with an unexpected voltage trip the bench
 
 
 class _NoCamera:
@@ -94,11 +92,10 @@ class LiveBench:
         lease_s: float = 1.5,
     ) -> None:
         self._leases = PageLeases(lease_s)
-        self._rig, self._writer = rig, writer
+        self._rig = rig
         self._picture = None if picture is None else PictureFile(picture)
         self._read_loop, self._loop = read_loop, read_loop()
-        about = rig.description
-        self._lockin = lockin_of(about, CARRIER_HZ)
+        self._signals, self._idle = LiveSignals(rig, writer, CARRIER_HZ), IdleWatch(rig)
         self._mutex = threading.Lock()  # protects all below
         self._turn = threading.Lock()  # held by a command until it ends; the next block waits
         self._request: ArmingRequest | None = None
@@ -112,13 +109,10 @@ class LiveBench:
         self._prepare, self._player = prepare, player or StudyPlayer()
         self._player.note = self._note
         self._study = ArmedStudy(rig, self._leases, self._player)
-        self._extrapolated = False  # the strain of the last block
-        self._unexpected = 0  # blocks in a row with an unexpected voltage
         self._reopen_s = 0.0  # time of the next attempt to open the board again
         self._over = False  # the panel has ended: commands are refused
         self._events: deque[tuple[float, str]] = deque(maxlen=_MOST_EVENTS)
         rig.bench.on_block = self._on_block
-        self._settled = about.switch_in_block + round(1e-3 * about.rate_hz)
 
     # ---- from other threads ------------------------------------------------------------------
 
@@ -142,7 +136,7 @@ class LiveBench:
             about.amplifier_gain, limits, about.name, self._rig.simulated, self._player.task,
             self._player.done, self._player.prompt, self._player.step, tuple(self._events),
             self._study.recorded, "" if job is None else job.options.folder.name,
-            self._extrapolated,
+            self._signals.extrapolated,
         )  # fmt: skip
 
     def do(
@@ -495,12 +489,12 @@ class LiveBench:
 
     def _play(self, job: StudyJob) -> None:
         """Play a study, and end at 0 V."""
-        self._lockin = lockin_of(self._rig.description, job.study.sensing.carrier_hz)
+        self._signals.sense_at(job.study.sensing.carrier_hz)
         reason = ""
         try:
             reason = self._study.play(job, self._picture)
         finally:
-            self._lockin = lockin_of(self._rig.description, CARRIER_HZ)
+            self._signals.sense_at(CARRIER_HZ)
             with self._mutex:
                 self._study.job = None
                 self._end(reason)
@@ -523,28 +517,9 @@ class LiveBench:
         codes = rig.acquisition.read()
         if self._closed is not None and self._reference is not None:
             self._closed.step(codes, self._reference)
-        if not self._holder and self._rig.safety.stage not in LIVE:
-            self._watch_idle(codes)
-
-    def _watch_idle(self, codes: NDArray[np.int16]) -> None:
-        """Trip if the voltage monitor shows a voltage although the bench is not armed.
-
-        For example, an instrument may have switched itself on.
-        """
-        rig = self._rig
-        limit_v, left_v = rig.safety.settings.residual_v, rig.bench.watch.residual_v(codes)
-        watched = rig.safety.settings.read_back and left_v >= limit_v
-        self._unexpected = self._unexpected + 1 if watched else 0
-        if self._unexpected == _IDLE_BLOCKS:
-            reason = (
-                f"The voltage monitor shows {left_v:.4g} V although the bench is not armed (limit "
-                f"{limit_v:g} V). Switch the high voltage off by hand, then check the instruments "
-                "and the monitor cables."
-            )
-            rig.safety.trip(reason)
-            if rig.safety.guardians is not None:
-                rig.safety.guardians.make_safe(reason)
-            self._end(reason)
+        watched = not self._holder and self._rig.safety.stage not in LIVE
+        if watched and (fault := self._idle.fault(codes)):
+            self._end(fault)
 
     def _look(self, picture: PictureFile) -> None:
         """Keep the last frame that has arrived, if there is a new one."""
@@ -561,22 +536,7 @@ class LiveBench:
 
     def _on_block(self, codes: NDArray[np.int16]) -> None:
         """Write the live signals of each block that is read, and end a study that must end."""
-        about, time_s = self._rig.description, self._rig.bench.time_s
         if self._study.job is not None:
             self._drive_v = self._rig.present_drive_v
         self._study.passed()
-        capacitance_f, _, valid = self._lockin.step(codes)
-        sensed_f = capacitance_f if valid and self._holder else math.nan
-        strain = math.nan
-        self._extrapolated = False
-        if self._loop is not None:
-            strain_map = self._loop.strain_map
-            low_f, high_f = strain_map.usable_f
-            if low_f <= sensed_f <= high_f:  # as in the loop
-                strain = float(strain_map.strain(sensed_f))
-                self._extrapolated = not bool(strain_map.inside(sensed_f))
-        seen_v = float(codes[self._settled :, 0].mean()) * about.volt_per_code
-        residual_v = seen_v / about.monitor_v_per_drive_v - self._rig.present_drive_v
-        reference = math.nan if self._reference is None else self._reference
-        values = (self._rig.present_drive_v, reference, sensed_f, strain, residual_v)
-        self._writer.append(codes, time_s, values)
+        self._signals.append(codes, self._loop, self._reference, armed=bool(self._holder))

@@ -22,7 +22,8 @@ from haselab.cli.identify.common import (
 from haselab.cli.options import shared_option
 from haselab.cli.plot import save_plot
 from haselab.identify.record import Record
-from haselab.identify.sampled.arx import ArxOrders, fit_arx
+from haselab.identify.sampled.arx import fit_arx
+from haselab.identify.sampled.arx_equation import ArxOrders
 from haselab.identify.sampled.subspace import fit_subspace
 from haselab.store.columns.selection import ColumnOptions
 

@@ -2,31 +2,31 @@
 
 from __future__ import annotations
 
-import itertools
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
-from functools import cached_property
 from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from haselab.base import (
-    Estimate,
-    InputError,
-    JsonObject,
-    ResultError,
-    check_fields,
-    checked,
-)
+from haselab.base import Estimate, InputError, JsonObject, ResultError, checked
 from haselab.base.chart import Chart
 from haselab.base.estimate import Z95
 from haselab.identify.clipped import clipping_of
 from haselab.identify.fit import RecordFit
-from haselab.identify.noise import coloured_covariance, fit_percent, whiteness_p
+from haselab.identify.noise import fit_percent, whiteness_p
 from haselab.identify.record import Record, finite_vector
-from haselab.identify.sampled.arx_bias import instrumental_coefficients, regressors
+from haselab.identify.sampled.arx_bias import instrumental_coefficients
+from haselab.identify.sampled.arx_equation import (
+    SEARCH_DELAY,
+    ArxOrders,
+    Solved,
+    chosen_orders,
+    criteria_of,
+    has_constant,
+    solve,
+)
 from haselab.identify.sampled.record import (
     check_same_rate,
     sampled_chart,
@@ -37,52 +37,14 @@ from haselab.identify.sampled.responds import responds
 from haselab.models import ArxModel
 from haselab.models.filters import lfilter
 
-__all__ = ["ArxFit", "ArxOrders", "fit_arx"]
+__all__ = ["ArxFit", "fit_arx"]
 
 Floats = NDArray[np.float64]
 _CRITERIA = ("bic", "aic")
-_MOST = {"na": 12, "nb": 64, "nk": 1000}
-_SEARCH_ORDER = 4
-_SEARCH_DELAY = 12
 _WHITE = 0.05
 _COLOURED = 1e-3  # whiteness below which a difference from unbiased coefficients counts
 _BIASED = 1.5  # times the error of a simulation with unbiased coefficients: no result
-_CONSTANT = 2.5  # standard deviations of a constant that is part of the equation
 _UNKNOWN = (-math.inf, math.inf)
-
-
-@dataclass(frozen=True)
-class ArxOrders:
-    """Size of a difference equation.
-
-    Args:
-        na: number of earlier outputs.
-        nb: number of inputs.
-        nk: delay in samples from an input to the first output that depends on it.
-    Raises:
-        InputError: an order out of range.
-    """
-
-    na: int = 2
-    nb: int = 2
-    nk: int = 1
-
-    def __post_init__(self) -> None:
-        check_fields(self)
-        for name, least in (("na", 0), ("nb", 1), ("nk", 0)):
-            value, most = getattr(self, name), _MOST[name]
-            if not least <= value <= most:
-                raise InputError(f"{name} = {value}; it must be {least} to {most}.")
-
-    @property
-    def memory(self) -> int:
-        """Number of samples before the first predicted one."""
-        return max(self.na, self.nb + self.nk - 1)
-
-    @property
-    def numbers(self) -> tuple[int, int, int]:
-        """na, nb and nk."""
-        return self.na, self.nb, self.nk
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -302,108 +264,20 @@ def fit_arx(
     record = single_driven_record(records)
     point = (float(record.u.mean()), float(record.y.mean())) if remove_means else (0.0, 0.0)
     inputs, outputs = record.u - point[0], record.y - point[1]
-    trials = 1 if orders is not None else _SEARCH_DELAY
+    trials = 1 if orders is not None else SEARCH_DELAY
     if orders is None:
         least_delay = 1 if record.hold == "zero" else 0
-        orders = _chosen(inputs, outputs, criterion, constant=remove_means, least_delay=least_delay)
+        orders = chosen_orders(
+            inputs, outputs, criterion, constant=remove_means, least_delay=least_delay
+        )
     least = orders.memory + 2 * (orders.na + orders.nb)
     if inputs.size <= least:
         raise InputError(
             f"The record has {inputs.size} samples; it must have more than {least} for na = "
             f"{orders.na}, nb = {orders.nb}, nk = {orders.nk}. Record longer, or lower the orders."
         )
-    constant = remove_means and _has_constant(inputs, outputs, orders)
+    constant = remove_means and has_constant(inputs, outputs, orders)
     return _fit(record, inputs, outputs, orders, point, constant, trials)
-
-
-@dataclass(frozen=True)
-class _Solved:
-    """Least-squares solution.
-
-    Args:
-        coefficients: `a`, then `b`.
-        covariance: of them.
-        errors: prediction errors.
-        columns: regressors. Shape `(M, P)`, with a column of ones if there is a constant.
-        constant: the constant of the equation and its standard deviation; 0 if it has none.
-    """
-
-    coefficients: Floats
-    covariance: Floats
-    errors: Floats
-    columns: Floats
-    constant: tuple[float, float] = (0.0, math.inf)
-
-    @cached_property
-    def coloured_covariance(self) -> Floats:
-        """Covariance of the coefficients for coloured prediction errors."""
-        wide = coloured_covariance([self.columns], [self.errors], self.columns.shape[1])
-        return wide[: self.coefficients.size, : self.coefficients.size]
-
-
-def _solved(u: Floats, y: Floats, orders: ArxOrders, *, constant: bool) -> _Solved:
-    """Solve the equations, with a constant if asked to."""
-    columns = regressors(u, y, orders.numbers, orders.memory)
-    columns = np.hstack([columns, np.ones((columns.shape[0], int(constant)))])
-    target = y[orders.memory :]
-    scale = np.sqrt((columns**2).sum(axis=0))
-    scale[scale == 0.0] = 1.0
-    left, sizes, right = np.linalg.svd(columns / scale, full_matrices=False)
-    regular = sizes > 1e-12 * sizes[0]
-    sizes = np.where(regular, sizes, np.inf)
-    coefficients = right.T @ ((left.T @ target) / sizes) / scale
-    errors = target - columns @ coefficients
-    freedom = max(target.size - coefficients.size, 1)
-    covariance = (right.T / sizes**2) @ right * float(errors @ errors) / freedom
-    blind = (np.abs(right[~regular]) > 1e-6).any(axis=0)
-    covariance[blind, blind] = np.inf
-    covariance = covariance / np.outer(scale, scale)
-    if not constant:
-        return _Solved(coefficients, covariance, errors, columns)
-    fitted = float(coefficients[-1]), math.sqrt(max(float(covariance[-1, -1]), 0.0))
-    return _Solved(coefficients[:-1], covariance[:-1, :-1], errors, columns, fitted)
-
-
-def _has_constant(u: Floats, y: Floats, orders: ArxOrders) -> bool:
-    """Whether the equation needs a constant, as for a record that begins far from its means."""
-    value, std = _solved(u, y, orders, constant=True).constant
-    return abs(value) > _CONSTANT * std
-
-
-def _chosen(u: Floats, y: Floats, criterion: str, *, constant: bool, least_delay: int) -> ArxOrders:
-    """The orders of the lowest criterion; all are compared on the samples left by the largest."""
-    most_delay = min(_SEARCH_DELAY, max(1, y.size // 8))
-    drives = most_delay + _SEARCH_ORDER - least_delay
-    largest = ArxOrders(_SEARCH_ORDER, drives, least_delay)
-    columns = regressors(u, y, largest.numbers, largest.memory)
-    ones = np.ones((columns.shape[0], int(constant)))
-    all_columns = np.column_stack([ones, columns, y[largest.memory :]])
-    # Least squares on the triangular factor equals that on the record for any choice of columns.
-    triangle: Floats = np.asarray(np.linalg.qr(all_columns, mode="r"))
-    count = all_columns.shape[0]
-    floor = count * (1e-12 * float(np.ptp(y))) ** 2
-    best, lowest = ArxOrders(1, 1, 1), math.inf
-    counts = range(1, _SEARCH_ORDER + 1)
-    delays = range(least_delay, most_delay + 1)
-    for na, nb, nk in itertools.product(counts, range(1, _SEARCH_ORDER + 2), delays):
-        if nb > na + (nk == 0) or nb + nk - least_delay > drives:
-            continue
-        kept = np.concatenate([np.arange(na), _SEARCH_ORDER + nk - least_delay + np.arange(nb)])
-        kept = np.concatenate([np.arange(int(constant)), constant + kept])
-        coefficients = np.linalg.lstsq(triangle[:, kept], triangle[:, -1], rcond=None)[0]
-        cost = float(((triangle[:, -1] - triangle[:, kept] @ coefficients) ** 2).sum())
-        score = _criteria(cost + floor, count, na + nb)[criterion]
-        if score < lowest:
-            best, lowest = ArxOrders(na, nb, nk), score
-    return best
-
-
-def _criteria(cost: float, count: int, coefficients: int) -> dict[str, float]:
-    likelihood = count * math.log(max(cost / count, 1e-300))
-    return {
-        "aic": likelihood + 2.0 * (coefficients + 1),
-        "bic": likelihood + math.log(count) * (coefficients + 1),
-    }
 
 
 def _fit(
@@ -416,10 +290,10 @@ def _fit(
     trials: int,
 ) -> ArxFit:
     rate_hz = record.input_rate_hz
-    solved = _solved(u, y, orders, constant=constant)
+    solved = solve(u, y, orders, constant=constant)
     coefficients, errors = solved.coefficients, solved.errors
     model = ArxModel(coefficients[: orders.na], coefficients[orders.na :], orders.nk, rate_hz)
-    criteria = _criteria(float(errors @ errors), errors.size, coefficients.size)
+    criteria = criteria_of(float(errors @ errors), errors.size, coefficients.size)
     whiteness = whiteness_p([errors])
     status, covariance = "ok", solved.covariance
     if clipped := clipping_of(record.y, "outputs"):
@@ -466,7 +340,7 @@ def _fit(
     return replace(fit, notes=_notes(fit, model))
 
 
-def _responds(solved: _Solved, orders: ArxOrders, trials: int, *, white: bool) -> bool:
+def _responds(solved: Solved, orders: ArxOrders, trials: int, *, white: bool) -> bool:
     """Whether the output depends on the input, with the best of some delays."""
     if not np.abs(solved.errors).max() > 0.0:
         return True
@@ -476,7 +350,7 @@ def _responds(solved: _Solved, orders: ArxOrders, trials: int, *, white: bool) -
 
 
 def _with_bias(
-    solved: _Solved, u: Floats, y: Floats, orders: ArxOrders, rate_hz: float, whiteness: float
+    solved: Solved, u: Floats, y: Floats, orders: ArxOrders, rate_hz: float, whiteness: float
 ) -> tuple[str, Floats]:
     """Status, and a covariance that includes the bias, where the prediction errors are coloured."""
     size, constant = solved.coefficients.size, solved.columns.shape[1] > solved.coefficients.size
@@ -534,7 +408,7 @@ def _validation_percent(
     cut = (3 * y.size) // 4
     if min(cut, y.size - cut) <= orders.memory + 2 * (orders.na + orders.nb):
         return math.nan
-    coefficients = _solved(u[:cut], y[:cut], orders, constant=constant).coefficients
+    coefficients = solve(u[:cut], y[:cut], orders, constant=constant).coefficients
     model = ArxModel(coefficients[: orders.na], coefficients[orders.na :], orders.nk, rate_hz)
     return _simulation_percent(model, u[cut:], y[cut:], constant=constant)
 

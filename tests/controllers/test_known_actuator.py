@@ -21,6 +21,7 @@ from haselab.controllers import (
     OpenLoop,
     known_actuator,
 )
+from haselab.controllers.motion_model import MotionModel
 from haselab.models.actuator import ActuatorTables
 
 LONGEST_M = 0.08
@@ -144,3 +145,15 @@ def test_the_preview_covers_its_time_in_whole_steps():
     kind = ControllerKind("ahead", OpenLoop, preview_s=0.05)
     assert [kind.preview_steps(period_s) for period_s in (0.01, 0.001, 0.02)] == [5, 50, 3]
     assert np.isclose(ControllerKind("none", OpenLoop).preview_steps(0.01), 0)
+
+
+@pytest.mark.parametrize("setting", KINDS, ids=[row[0] for row in KINDS])
+def test_the_natural_frequency_is_that_of_the_linearised_motion(setting):
+    """Against the size of the eigenvalues of 1 ms of motion, which damping hardly changes."""
+    actuator = known(*setting)
+    motion, length_m = MotionModel(actuator), actuator.length_m(0.01)
+    values = np.linalg.eigvals(motion.linear(length_m, 0.0, 1e-3))
+    swinging = max(values, key=lambda value: abs(value.imag))
+    found = motion.natural_rad_s(length_m, length_m)
+    assert found == pytest.approx(abs(np.log(swinging)) / 1e-3, rel=0.02)
+    assert motion.natural_rad_s(actuator.length_m(-0.01), actuator.length_m(0.02)) >= found

@@ -125,6 +125,29 @@ def test_the_step_of_the_first_output_is_no_jump_and_a_later_one_is(queued: int)
             assert found in (block, block + 1)
 
 
+def test_an_actuator_with_a_high_resonance_may_move_as_fast_as_it_can() -> None:
+    """A step by 0.35 of the range, hardly damped, at 16 Hz; a slow actuator cannot do this."""
+    fast = replace(MODEL, resonance_rad_s=2.0 * math.pi * 16.0)
+    step = np.repeat([0.0, 0.35 * MODEL.range], [20, 60])
+    strains = second_order(step, fast.resonance_rad_s, 0.05, 1.0)
+    strains += 1e-4 * np.random.default_rng(4).standard_normal(80)
+    drives = EQ4.voltage_v(step)
+    for model, said in ((fast, ""), (MODEL, "Strain jumped")):
+        found, fault = watched(strains, drives, step, LoopWatchdog(model, SETTINGS))
+        assert (found > 0, fault[: len(said)]) == (bool(said), said)
+
+
+def test_a_high_resonance_does_not_hide_a_broken_sensor() -> None:
+    """At any resonance, a jump by 0.6 of the range is found."""
+    for resonance_hz in (16.0, 50.0, 500.0):
+        model = replace(MODEL, resonance_rad_s=2.0 * math.pi * resonance_hz)
+        strains = 1e-4 * np.random.default_rng(9).standard_normal(60)
+        strains[40] += 0.6 * MODEL.range
+        watchdog = LoopWatchdog(model, replace(SETTINGS, range_margin=1e3))
+        found, fault = watched(strains, np.ones(60), np.zeros(60), watchdog)
+        assert "Strain jumped" in fault and found == 40
+
+
 def test_the_charging_energy_is_limited() -> None:
     rng = np.random.default_rng(6)
     drives = np.where(np.arange(100) % 2, 0.78, 1.22)  # below the swings that count

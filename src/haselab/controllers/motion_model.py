@@ -150,6 +150,21 @@ class MotionModel:
         held_n = self.inertia_kg * pushed_m_s2 + self.damping_n_s_per_m * speed_m_s
         return held_n + now_n + creep_n - self.weight_n - state[-1]
 
+    def natural_rad_s(self, low_m: float, high_m: float) -> float:
+        """Highest natural frequency between two lengths: that of the stiffness before any creep.
+
+        Args:
+            low_m: shortest length.
+            high_m: longest one.
+        Returns:
+            Angular frequency, without damping.
+        """
+        first, last = self._at(low_m)[0], self._at(high_m)[0]
+        rises_n = np.diff(self._elastic[first : last + 2])
+        branches = 1.0 + sum(share for share, _ in self.branches)
+        per_m = max(float(rises_n.max()), 0.0) / self._step_m * branches
+        return math.sqrt(per_m / self.inertia_kg)
+
     def linear(self, length_m: float, drive_v: float, time_s: float) -> Floats:
         """Derivatives of the state after a time by the state, at rest.
 

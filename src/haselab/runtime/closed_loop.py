@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 from haselab import _core
 from haselab.base import SafetyError
 from haselab.controllers import ControllerSetting, Measurement
+from haselab.controllers.motion_model import MotionModel
 from haselab.rig import RigDescription
 from haselab.runtime.lockin import counted_s, lockin_of, printed_chain_of
 from haselab.runtime.loop import LoopSettings, RunningController
@@ -205,6 +206,14 @@ def setting_on_rig(rig: RigDescription, carrier_hz: float, loop: LoopSettings) -
     return loop.setting(rig.block_s, delay_s, limits_v, age_s)
 
 
+def _resonance_rad_s(loop: LoopSettings) -> float:
+    """Highest natural frequency of the identified actuator in the loop's range; 0: unknown."""
+    if (known := loop.actuator) is None:
+        return 0.0
+    ends_m = known.length_m(loop.saturation.low), known.length_m(loop.saturation.high)
+    return MotionModel(known).natural_rad_s(min(ends_m), max(ends_m))
+
+
 def _watchdog(rig: GuardedRig, carrier: tuple[float, float], loop: LoopSettings) -> LoopWatchdog:
     settings, by_video = rig.safety.settings, loop.video_zero_px is not None
     range_f = loop.strain_map.range_f or (0.0, 0.0)
@@ -220,6 +229,7 @@ def _watchdog(rig: GuardedRig, carrier: tuple[float, float], loop: LoopSettings)
         None if by_video else loop.strain_map.coefficients,
         0.5 * (range_f[0] + range_f[1]),
         loop.controller.kind.alternates,
+        _resonance_rad_s(loop),
     )
     return LoopWatchdog(
         model, settings.loop, settings.rating, rig.present_drive_v, rig.bench.is_settled

@@ -14,6 +14,8 @@ from haselab.rig import RigDescription
 __all__ = ["LoopModel", "capacitance_range", "loop_model"]
 
 _GRID = 501
+_SLOW = 0.25  # 1 - cos(w T) of actuators to which jump_share applies: 11.5 Hz with 10 ms
+_MOST_QUICK = 10.0 / 3.0  # a broken sensor must still be found: half of the range by default
 _REAL = 1e-9  # relative imaginary part of a root that is a rounding error
 
 
@@ -38,6 +40,7 @@ class LoopModel:
             strain does not come from the capacitance.
         capacitance_f: a capacitance in the range of the map; 0: unknown.
         alternates: whether the sign of the drive alternates on purpose.
+        resonance_rad_s: highest natural frequency of the actuator; 0: unknown.
     """
 
     block_s: float
@@ -54,11 +57,21 @@ class LoopModel:
     capacitance_map: tuple[float, float, float, float] | None
     capacitance_f: float
     alternates: bool = False
+    resonance_rad_s: float = 0.0
 
     @property
     def range(self) -> float:
         """Width of the strain range."""
         return self.strain_high - self.strain_low
+
+    @property
+    def quickness(self) -> float:
+        """How much more than a slow actuator's the rate of strain may change from block to block.
+
+        After a step by x without damping, it changes by $2 x (1 - \\cos\\omega T)$ at most.
+        """
+        turned = min(self.resonance_rad_s * self.block_s, math.pi)
+        return min(max((1.0 - math.cos(turned)) / _SLOW, 1.0), _MOST_QUICK)
 
 
 def loop_model(
@@ -70,6 +83,7 @@ def loop_model(
     capacitance_map: tuple[float, float, float, float] | None,
     capacitance_f: float = 0.0,
     alternates: bool = False,
+    resonance_rad_s: float = 0.0,
 ) -> LoopModel:
     """Build the model of a loop on a rig.
 
@@ -82,6 +96,7 @@ def loop_model(
         capacitance_map: see `LoopModel`.
         capacitance_f: see `LoopModel`.
         alternates: see `LoopModel`.
+        resonance_rad_s: see `LoopModel`.
     """
     low, high = min(saturation[0], 0.0), max(saturation[1], 0.0)
     strain = np.linspace(low, high, _GRID)
@@ -105,6 +120,7 @@ def loop_model(
         capacitance_map=capacitance_map,
         capacitance_f=capacitance_f,
         alternates=alternates,
+        resonance_rad_s=resonance_rad_s,
     )
 
 

@@ -90,8 +90,8 @@ class Jumps:
     """Check changes of the strain rate, which the actuator's inertia limits."""
 
     def __init__(self, model: LoopModel, settings: WatchdogSettings) -> None:
-        self._limit = settings.jump_share * model.range
-        self._chatter = settings.chatter_share * model.range
+        self._limit = settings.jump_share * model.range * model.quickness
+        self._chatter = settings.chatter_share * model.range * model.quickness
         count = max(round(_CHATTER_S / model.block_s), 8)
         self._squares: deque[float] = deque(maxlen=count)
         self._sum = 0.0

@@ -69,7 +69,8 @@ class WatchdogSettings:
         repeat_s: how long a block, strain or frame may repeat values of the last second.
         lost_share: fraction of the blocks of a window that may have no strain.
         jump_share: change of the strain's rate from one block to the next, as a fraction of the
-            range; six times the recent scatter is added.
+            range; six times the recent scatter is added. For actuators with a resonance above
+            11.5 Hz (blocks of 10 ms) both shares are larger, see `LoopModel.quickness`.
         chatter_share: RMS of that change over 0.2 s, as a fraction of the range.
         swing_share: smallest reversal of the drive that counts as a swing, as a fraction of its
             limits.

@@ -210,12 +210,17 @@ class ChipSettings:
     usable_f: tuple[float, float] | None = None
 
     def __post_init__(self) -> None:
-        numbers = [self.kp, self.ki, self.kd, self.strain_low, self.strain_high, *self.voltage_map,
-                   *self.strain_map]  # fmt: skip
-        if not np.isfinite(numbers).all() or not self.strain_low < self.strain_high:
+        for name in ("kp", "ki", "kd", "strain_low", "strain_high", "voltage_map", "strain_map"):
+            if not np.isfinite(getattr(self, name)).all():
+                raise InputError(
+                    f"{name} = {getattr(self, name)} of the microcontroller must be finite. Design "
+                    "the controller again."
+                )
+        if not self.strain_low < self.strain_high:
             raise InputError(
-                f"The microcontroller's settings {numbers} must be finite, and the saturation's "
-                "low end below its high end. Design the controller again."
+                f"The strains that the microcontroller's output reaches are {self.strain_low:g} to "
+                f"{self.strain_high:g} within the controller's limits, which is no range. Give "
+                "other --limits to 'haselab design'."
             )
         if not 0.0 < self.drive_high_v < _OUTPUT_V:
             raise InputError(

@@ -55,7 +55,8 @@ class VoltageMap:
     def voltage_v(self, strain: ArrayLike) -> Floats:
         """Voltage, in V, for a strain. Shape of `strain`."""
         e = np.asarray(strain, dtype=np.float64)
-        return np.asarray(self.a1_v * np.exp(self.b1 * e) + self.a2_v * np.exp(self.b2 * e))
+        with np.errstate(over="ignore", invalid="ignore"):  # far outside the map: inf or NaN
+            return np.asarray(self.a1_v * np.exp(self.b1 * e) + self.a2_v * np.exp(self.b2 * e))
 
     def slope_v(self, strain: ArrayLike) -> Floats:
         """Derivative of the voltage with respect to the strain, in V. Shape of `strain`."""

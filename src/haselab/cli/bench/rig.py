@@ -208,7 +208,9 @@ def _live_warning(rig: Rig, plan: LivePlan, file: RigFile) -> str:
         )
     elif rig.controller is not None:
         what = "the microcontroller closes its loop at zero strain for 0.5 s, up to "
-        volts = f"{what}{1e-3 * d.drive_limits.high * d.amplifier_gain:g} kV"
+        ends = d.drive_limits.low, d.drive_limits.high
+        low_kv, high_kv = (1e-3 * end * d.amplifier_gain for end in ends)
+        volts = f"{what}{f'{low_kv:g} or ' if low_kv < 0.0 else ''}{high_kv:g} kV"
     else:
         volts = (
             f"a step of {1e-3 * live_step_v(d) * d.amplifier_gain:g} kV, a sensing signal of "

@@ -30,6 +30,16 @@ def test_gymnasium_finds_and_accepts_each(task: str) -> None:
     check_env(env.unwrapped, skip_render_check=False)
 
 
+@pytest.mark.parametrize("task", list(TASKS))
+def test_stable_baselines_accepts_each(task: str) -> None:
+    reason = "stable-baselines3: pip install it"
+    checker = pytest.importorskip("stable_baselines3.common.env_checker", reason=reason)
+    env = gymnasium.make(f"haselab.learning:haselab/{task.capitalize()}-v0", devices=DEVICES)
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        checker.check_env(env.unwrapped)
+
+
 def test_the_vector_form_has_the_episodes_of_the_single_one() -> None:
     """One loop: the same numbers in both, up to the end of the episode and over it."""
     kwargs = {"devices": DEVICES, "episode_s": 0.5}

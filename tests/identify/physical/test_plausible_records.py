@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 
 from haselab.actuators import (
+    ACTUATORS,
     GRAVITY_M_S2,
     CurlingHasel,
     DeaStack,
@@ -16,6 +17,8 @@ from haselab.actuators import (
 )
 from haselab.identify.physical import MotionRecord, fit_actuator
 from haselab.identify.physical.plausible import find_implausible
+from haselab.scoreboard.devices import DEVICES, find_device
+from haselab.scoreboard.knowledge import TRAINED, simulated_record
 
 KINDS = {
     "planar-hasel": (PlanarHasel(), 0.25, 8e3),
@@ -165,3 +168,18 @@ def test_a_record_of_one_length_and_many_capacitances_is_compared_with_no_motion
         length_std_m=record.length_std_m[:1], length_experiment=record.length_experiment[:1],
     )  # fmt: skip
     assert find_implausible(law, [one]) == ""
+
+
+@pytest.mark.parametrize("name", list(DEVICES))
+def test_a_short_study_of_any_device_is_plausible_until_masses_are_swapped(name):
+    """A mass is lifted for 0.2 s, in which the slow devices hardly move."""
+    device = find_device(name)
+    law = ACTUATORS.find(device.config.kind)()
+    record = simulated_record(device, np.random.default_rng(1))
+    assert find_implausible(law, [record]) == ""
+    mass_kg = record.drive.mass_kg
+    light, heavy = mass_kg == 0.6 * device.mass_kg, mass_kg == TRAINED * device.mass_kg
+    stated_kg = np.where(light, TRAINED * device.mass_kg, mass_kg)
+    stated_kg[heavy] = 0.6 * device.mass_kg
+    swapped = replace(record.drive, mass_kg=stated_kg, load_n=GRAVITY_M_S2 * stated_kg)
+    assert "masses, which may be swapped" in find_implausible(law, [replace(record, drive=swapped)])

@@ -39,6 +39,7 @@ _LOW = 0.3  # of the highest voltage, below which the load decides the length
 _HEAVIER = 1.1  # load over another one, whose lengths are compared
 _REVERSED = 0.25  # of the simulated difference of two lengths
 _LEAST_LENGTHS = 5  # of a load
+_MIDDLE = 0.1, 0.5, 0.9  # of the lengths under a load: least, middle and most
 _MOVES = 1.5  # spread of all values over their noise; below, nothing moves
 _LEAST_STILL = 30  # values, whose spread is then certain to 13 %
 _LAGS, _BY_CHANCE = (0, 1, 2, 4, 6), 1e-6  # intervals of the drive; probability without motion
@@ -386,11 +387,13 @@ def _sign(record: MotionRecord, simulated_m: Floats | None) -> str:
 
 @dataclass(frozen=True)
 class _Level:
-    """Length of a record under one load and a low voltage."""
+    """Lengths of a record under one load and a low voltage, without the farthest tenths."""
 
     name: str
     load_n: float
     seen_m: float
+    least_m: float
+    most_m: float
     simulated_m: float
     noise_m: float
 
@@ -402,10 +405,13 @@ def _levels(record: MotionRecord, simulated_m: Floats) -> Iterator[_Level]:
     for load_n in np.unique(drive.load_n):
         chosen = low & (drive.load_n[interval] == load_n)
         if np.count_nonzero(chosen) >= _LEAST_LENGTHS:
+            least_m, seen_m, most_m = np.quantile(record.length_m[chosen], _MIDDLE)
             yield _Level(
                 record.name,
                 float(load_n),
-                float(np.median(record.length_m[chosen])),
+                float(seen_m),
+                float(least_m),
+                float(most_m),
                 float(np.median(simulated_m[chosen])),
                 float(np.median(record.length_std_m)),
             )
@@ -435,6 +441,8 @@ def _loads(
             continue
         shorter_m = light.seen_m - heavy.seen_m
         if shorter_m <= max(_REVERSED * longer_m, _STILL * light.noise_m):
+            continue
+        if light.least_m < heavy.most_m:  # still in motion after the last change of the load
             continue
         # creep after the previous load may exceed the difference of two similar loads
         if longer_m > _DECIDES * _stretch_m(law, light.load_n, heavy.load_n):

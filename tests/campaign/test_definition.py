@@ -64,6 +64,19 @@ BAD = {
     "delay of the loop": (
         GEOMETRY.replace("geometry", "controller") + "twin.acquisition.output_delay_s = [1e-3]\n",
         "output_delay_s has no effect"),
+    "name": (GEOMETRY + 'twin.name = ["a", "b"]\n', "name has no effect"),
+    "reading": (
+        GEOMETRY.replace("geometry", "controller") + 'twin.reading = ["hz", "rad"]\n',
+        "reading has no effect"),
+    "monitor of the chip": (
+        GEOMETRY.replace("geometry", "controller").replace(
+            "[parameters]", '[case]\nloop = "chip-1khz"\n[parameters]')
+        + "twin.acquisition.bits = [8, 16]\n",
+        "bits has no effect"),
+    "monitor of two loops of the chip": (
+        GEOMETRY.replace("geometry", "controller")
+        + 'case.loop = ["chip-1khz", "oracle"]\ntwin.acquisition.bits = [8, 16]\n',
+        "bits has no effect"),
     "no samples": (DRAWN.replace("samples = 4\n", ""), "design.samples is missing; random"),
     "no samples at all": (DRAWN.replace("= 4", "= 0"), "design.samples: .*greater than or equal"),
     "not a power of two": (

@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import json
 import math
+import random
+import re
 from collections.abc import Iterable
 from typing import Any
 
@@ -18,6 +20,7 @@ from haselab.campaign.kinds.case_kind import CASE_KINDS, CaseKind, Inputs
 from haselab.campaign.kinds.geometry import GEOMETRY, GeometrySettings
 from haselab.campaign.work import compute_cases
 from haselab.rig.twin.config import twin_of_reading
+from haselab.scoreboard.devices import find_device
 from haselab.scoreboard.plant import fast_bench
 
 HZ = {"twin": twin_of_reading("hz").model_dump(mode="json")}
@@ -113,7 +116,6 @@ def test_a_controller_plays_its_task_on_the_device_of_the_case(
     from haselab.controllers import CONTROLLERS, ChosenController
     from haselab.scoreboard import CLASSES, TASKS
     from haselab.scoreboard.board import known_in_class
-    from haselab.scoreboard.devices import find_device
     from haselab.scoreboard.entrants import PAPER_PI
     from haselab.scoreboard.knowledge import true_actuator
     from haselab.scoreboard.play import play
@@ -210,7 +212,7 @@ def _change_numbers(table: dict[str, Any], keys: Iterable[str]) -> int:
     count = 0
     for key in keys:
         first, _, rest = key.partition(".")
-        value = table[first]
+        value = table.get(first)
         if isinstance(value, dict):
             count += _change_numbers(value, [rest] if rest else value)
         elif isinstance(value, int | float) and not isinstance(value, bool):
@@ -221,17 +223,83 @@ def _change_numbers(table: dict[str, Any], keys: Iterable[str]) -> int:
 
 
 @pytest.mark.long
-@pytest.mark.parametrize("name", ["geometry", "controller"])
-def test_what_a_kind_ignores_changes_no_result(name: str) -> None:
+@pytest.mark.parametrize(
+    ("name", "case", "device"),
+    [
+        ("geometry", {}, "hz"),
+        ("geometry", {}, "dea-stack"),
+        ("controller", {}, "hz"),
+        ("controller", {"loop": "chip-1khz"}, "hz"),
+        ("controller", {"task": "T8-stack"}, "dea-stack"),
+    ],
+)
+def test_what_a_kind_ignores_changes_no_result(name: str, case: Any, device: str) -> None:
     kind = CASE_KINDS.find(name)
-    case = kind.settings().model_dump()
-    changed = json.loads(json.dumps(HZ))
-    assert _change_numbers(changed, kind.ignored) > 10
+    config = find_device(device).config.model_dump(mode="json", exclude={"origin"})
+    inputs = Inputs({"case": {**kind.settings().model_dump(), **case}, "twin": config})
+    if device == "dea-stack":
+        config["actuator"] = {"series_ohm": 1e5, "leakage_ohm": 1e10}
+    changed = json.loads(json.dumps(inputs.tables))
+    ignored = [*kind.ignored, *kind.ignored_by(inputs)]
+    if device == "dea-stack":  # which has no tables of a planar HASEL
+        ignored = [key for key in ignored if not re.match(r"twin\.(dielectric|unmodelled)", key)]
+    assert _change_numbers(changed, ignored) > 10
     public, found = (
-        dict(kind.compute(Inputs({"case": case, **tables}), np.random.default_rng(1)))
-        for tables in (HZ, changed)
+        dict(kind.compute(one, np.random.default_rng(1))) for one in (inputs, Inputs(changed))
     )
     assert found == public
+
+
+def test_a_controller_of_the_chip_has_the_noise_of_the_chip() -> None:
+    kind = CASE_KINDS.find("controller")
+    host, chip = (
+        Inputs({"case": {**kind.settings().model_dump(), "loop": loop}, **HZ})
+        for loop in ("host-100hz", "chip-1khz")
+    )
+    assert "twin.acquisition.bits" in kind.ignored_by(chip) and kind.ignored_by(host) == ()
+
+
+def test_a_controller_that_draws_from_the_global_generators_is_reproducible(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    from haselab.campaign.kinds import controller as kind
+    from haselab.scoreboard.knowledge import true_actuator
+
+    drawn = []
+
+    class PlayedError(Exception):
+        pass
+
+    def play(*_: Any) -> None:
+        drawn.append((random.random(), np.random.random()))  # noqa: NPY002
+        raise PlayedError
+
+    monkeypatch.setattr(kind, "_known", lambda name: true_actuator(find_device(name)))
+    monkeypatch.setattr(kind, "play", play)
+    inputs = Inputs({"case": kind.CONTROLLER.settings().model_dump(), **HZ})
+    for seed in (1, 1, 2):
+        with pytest.raises(PlayedError, match=r"^$"):
+            kind.CONTROLLER.compute(inputs, np.random.default_rng(seed))
+    assert drawn[0] == drawn[1] and drawn[0] != drawn[2]
+
+
+@pytest.mark.parametrize("mass_kg", [0.2, 0.25, 0.275])
+def test_changes_of_the_load_are_relative_to_what_hangs_on_the_twin(mass_kg: float) -> None:
+    from haselab.campaign.kinds import controller as kind
+    from haselab.scoreboard import TASKS
+    from haselab.scoreboard.knowledge import true_actuator
+
+    known = true_actuator(find_device("hz"))
+    found = {
+        name: kind._scenario(TASKS[name], known, mass_kg, np.random.default_rng(3))
+        for name in ("T1", "T4", "T5", "T5-wide")
+    }
+    t4, t5, wide = ([kg for _, kg in found[name].loads] for name in ("T4", "T5", "T5-wide"))
+    assert t4 == pytest.approx(mass_kg * np.array([1.1, 1.0, 0.9, 1.0, 1.2, 1.0]))
+    assert t5[0] == pytest.approx(mass_kg + 0.025) and 0.7 <= t5[1] / mass_kg <= 1.6
+    assert wide[0] == mass_kg
+    same = TASKS["T1"].scenario(known, np.random.default_rng(3))
+    assert (found["T1"].zero_m, found["T1"].events) == (same.zero_m, same.events)
 
 
 def test_a_controller_moves_the_same_with_another_rate_of_the_converter() -> None:

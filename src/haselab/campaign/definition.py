@@ -179,7 +179,7 @@ def _checked(file: _File, path: Path) -> Campaign:
     axes, distributions = _parameters(file.parameters)
     for key in _paths(axes, distributions):
         _refuse_unknown(key, tables)
-        _refuse_ignored(key, kind)
+        _refuse_ignored(key, kind.name, kind.ignored)
     found = Campaign(
         file.name, file.kind, file.seed, tables, axes, distributions, file.design, file.time_limit_s
     )  # fmt: skip
@@ -188,7 +188,22 @@ def _checked(file: _File, path: Path) -> Campaign:
     for axis in axes:
         for value in axis.values:
             _check_value(found, axis.path, value)
+    ignored = _ignored_everywhere(found)
+    for key in _paths(axes, distributions):
+        _refuse_ignored(key, kind.name, ignored)
     return found
+
+
+def _ignored_everywhere(campaign: Campaign) -> tuple[str, ...]:
+    """Keys without effect at every value of the axes of `case`."""
+    kind, tables = campaign.case_kind, campaign.tables
+    cases = [axis for axis in campaign.axes if axis.path.startswith("case.")]
+    every = [
+        set(kind.ignored_by(Inputs(with_values(tables, {axis.path: value}))))
+        for axis in cases
+        for value in axis.values
+    ]
+    return tuple(set.intersection(*every) if every else kind.ignored_by(Inputs(tables)))
 
 
 def _base(base: Mapping[str, str], kind: CaseKind, folder: Path) -> dict[str, JsonObject]:
@@ -375,11 +390,11 @@ def _refuse_unknown(path: str, tables: Mapping[str, JsonObject]) -> None:
         )
 
 
-def _refuse_ignored(path: str, kind: CaseKind) -> None:
-    if any(path == key or path.startswith(f"{key}.") for key in kind.ignored):
+def _refuse_ignored(path: str, kind: str, ignored: Sequence[str]) -> None:
+    if any(path == key or path.startswith(f"{key}.") for key in ignored):
         raise InputError(
-            f"parameters.{path} has no effect on cases of the kind {kind.name!r}. Remove it, or "
-            "choose another kind."
+            f"parameters.{path} has no effect on cases of the kind {kind!r} with this [case]. "
+            "Remove it, or change the kind or [case]."
         )
 
 

@@ -35,7 +35,7 @@ from haselab.scoreboard.play import Scenario, play
 from haselab.scoreboard.processes import Lost, Workers, announce_limit
 from haselab.scoreboard.tasks import TASKS, Task
 
-__all__ = ["Entry", "Game", "Plan", "Played", "known_in_class", "play_board"]
+__all__ = ["Entry", "Game", "Plan", "Played", "known_in_class", "play_board", "seeded"]
 
 Floats = NDArray[np.float64]
 Item = TypeVar("Item")
@@ -176,7 +176,7 @@ def _design(job: _DesignJob) -> Entry:
     known = known_in_class(job.known, device, loop)
     try:
         seed = zlib.crc32(f"{job.controller} {job.loop} {job.device}".encode())
-        with _seeded([seed]), _deadline(600.0, "the design"):
+        with seeded([seed]), _deadline(600.0, "the design"):
             found = designed(CONTROLLERS.find(job.controller), loop, known)
     except TimeoutError as error:
         found = Designed(None, str(error))
@@ -216,7 +216,7 @@ def _play(job: _PlayJob) -> Played:
     longest_s = max(_SLOWEST * (scenario.duration_s + scenario.lead_s), _LEAST_S)
     try:
         with (
-            _seeded(_seed(job.seed, job.task, job.index)),
+            seeded(_seed(job.seed, job.task, job.index)),
             _deadline(longest_s, "the controller"),
         ):
             trace = play(scenario, chosen, loop, known, rng)
@@ -250,8 +250,12 @@ def _seed(seed: int, task: str, index: int) -> list[int]:
 
 
 @contextmanager
-def _seeded(seed: Sequence[int]) -> Iterator[None]:
-    """Seed the global generators that a controller may draw from, and restore them afterwards."""
+def seeded(seed: Sequence[int]) -> Iterator[None]:
+    """Seed the global generators that a controller may draw from, and restore them afterwards.
+
+    Args:
+        seed: whole numbers of at least 0.
+    """
     before = random.getstate(), np.random.get_state(legacy=False)  # noqa: NPY002
     number = int(np.random.SeedSequence(seed).generate_state(1)[0])
     random.seed(number)

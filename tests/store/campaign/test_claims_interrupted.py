@@ -96,3 +96,16 @@ def test_an_interrupt_leaves_another_program_s_claim(
             monkeypatch.setattr(Claims, "_is_alive", interrupted)
             second.take(7)
         assert claims_of(tmp_path) == ["7"]
+
+
+@pytest.mark.parametrize("damaged", [bytes(30), b"\xff\xfe\x80abc", b"../shards", b"two\nlines"])
+def test_a_damaged_claim_is_that_of_no_program(damaged: bytes, tmp_path: Path) -> None:
+    """After a power failure, some file systems leave files of NUL bytes."""
+    with Claims(tmp_path):
+        (tmp_path / "claims" / "7").write_bytes(damaged)
+        (tmp_path / "claims" / "8").write_bytes(damaged)
+        with Claims(tmp_path) as second:
+            assert claims_of(tmp_path) == []
+            (tmp_path / "claims" / "8").write_bytes(damaged)
+            assert second.take(8)
+    assert claims_of(tmp_path) == []

@@ -10,7 +10,10 @@ from haselab.rig.twin.config import READINGS, TwinConfig, twin_of_reading
 from haselab.rig.twin.twin_file import load_twin
 from haselab.store.toml import validated
 
-__all__ = ["TWIN", "twin_of"]
+__all__ = ["LABELS", "TWIN", "twin_of"]
+
+#: Keys of a twin without effect; `reading` chooses values when the file is read, before a case.
+LABELS = ("twin.name", "twin.reading", "twin.amplifier.name")
 
 
 def _twin(source: str, folder: Path) -> JsonObject:

@@ -68,6 +68,14 @@ class CaseKind(abc.ABC):
     #: Keys and tables without effect on the results, such as `twin.camera`; none can be varied.
     ignored: ClassVar[tuple[str, ...]] = ()
 
+    def ignored_by(self, inputs: Inputs) -> tuple[str, ...]:
+        """Return the keys without effect on a case, in addition to those of all cases.
+
+        Args:
+            inputs: of the case.
+        """
+        return ()
+
     @abc.abstractmethod
     def check(self, inputs: Inputs) -> None:
         """Check the tables without computing anything.

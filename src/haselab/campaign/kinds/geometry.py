@@ -11,7 +11,7 @@ from pydantic import Field
 from haselab.actuators import GRAVITY_M_S2, OperatingPoint, equilibrium_m, linearise
 from haselab.base import ResultError
 from haselab.base.root import root
-from haselab.campaign.kinds.base_files import TWIN, twin_of
+from haselab.campaign.kinds.base_files import LABELS, TWIN, twin_of
 from haselab.campaign.kinds.case_kind import CaseKind, Inputs, Results
 from haselab.store.toml import Section
 
@@ -38,8 +38,9 @@ class _Geometry(CaseKind):
     files = (TWIN,)
     settings = GeometrySettings
     ignored = (
-        "twin.amplifier", "twin.acquisition", "twin.camera", "twin.unmodelled",
+        *LABELS, "twin.amplifier", "twin.acquisition", "twin.camera", "twin.unmodelled",
         "twin.dielectric.series_ohm", "twin.dielectric.leakage_ohm",
+        "twin.actuator.series_ohm", "twin.actuator.leakage_ohm",
     )  # fmt: skip
 
     def check(self, inputs: Inputs) -> None:

@@ -9,7 +9,7 @@ import numpy as np
 from pydantic import Field
 
 from haselab.base import JsonObject, ResultError, SilentProgress
-from haselab.campaign.kinds.base_files import TWIN, twin_of
+from haselab.campaign.kinds.base_files import LABELS, TWIN, twin_of
 from haselab.campaign.kinds.case_kind import BaseFile, CaseKind, Inputs, Results
 from haselab.rig.twin.twin_bench import make_twin
 from haselab.safety.armed import armed
@@ -56,6 +56,7 @@ class _Play(CaseKind):
     name = "play"
     files = (TWIN, _STUDY)
     settings = PlaySettings
+    ignored = LABELS
 
     def check(self, inputs: Inputs) -> None:
         inputs.settings(PlaySettings)

@@ -71,7 +71,7 @@ class Claims:
         for block in tuple(self._held):
             with contextlib.suppress(OSError):
                 # After an interrupt, the claim may be that of another program.
-                if (self._claims / str(block)).read_text(encoding="utf-8") in ("", self.writer):
+                if _program_of(self._claims / str(block)) in ("", self.writer):
                     self.release(block)
         self._file.close()
         self._own.unlink(missing_ok=True)
@@ -151,9 +151,9 @@ class Claims:
     def _is_alive(self, claim: Path) -> bool:
         """Whether the program of a claim still works on it."""
         try:
-            name = claim.read_text(encoding="utf-8")
+            name = _program_of(claim)
             if not name:  # just created without a link, or its program ended in between
-                return _is_recent(claim)
+                return name is not None and _is_recent(claim)
             return self._is_program_alive(self._programs / name)
         except OSError:  # the claim has gone
             return False
@@ -169,6 +169,18 @@ class Claims:
             return _is_recent(program)
         except OSError:  # it has ended
             return False
+
+
+def _program_of(claim: Path) -> str | None:
+    """Name of the program that made a claim; empty if it has none yet; None if it is damaged.
+
+    A file system may fill the file with NUL bytes after a power failure.
+
+    Raises:
+        OSError: there is no such claim.
+    """
+    name = claim.read_bytes().decode("utf-8", "replace")
+    return name if name.isprintable() and "/" not in name else None
 
 
 def _is_recent(path: Path) -> bool:

@@ -228,9 +228,10 @@ class Shards:
         if stated and int(stated[1], 16) != zlib.crc32(data):
             raise _no_shard(path, "damaged: its checksum differs from that in its name")
         try:
-            file = self._parquet.ParquetFile(io.BytesIO(data))
+            # without threads: one that still holds `data` when Python ends aborts the program
+            file = self._parquet.ParquetFile(io.BytesIO(data), pre_buffer=False)
             wrong = _no_keys(file.schema_arrow)
-            table = None if wrong else file.read(columns=columns)
+            table = None if wrong else file.read(columns=columns, use_threads=False)
             if table is not None and not stated:
                 table.validate(full=True)
         except (self._arrow.ArrowException, KeyError, OSError, ValueError) as error:

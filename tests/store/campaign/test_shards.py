@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import errno
 import os
+import subprocess
+import sys
 import time
 from collections.abc import Callable
 from pathlib import Path
@@ -33,6 +35,23 @@ def test_rows_are_read_as_they_were_written_in_the_order_of_their_indices(tmp_pa
     names = [one.case for one in written]
     assert Shards(tmp_path, "b").rows(names, ["case.gain"]) == [written[2], written[0], failed]
     assert Shards(tmp_path, "b").rows(["case-1", "none"], ["case.gain"]) == [written[2]]
+
+
+@pytest.mark.skipif(not Path("/proc/self/task").is_dir(), reason="lists the threads of Linux")
+def test_no_thread_holds_a_shard_that_was_read(tmp_path: Path) -> None:
+    """Such a thread aborts the program that ends meanwhile: 5 of 60, in a measurement."""
+    Shards(tmp_path, "a").write([row(index) for index in range(2000)])
+    text = """
+import os, sys
+from pathlib import Path
+from haselab.store.campaign.shards import Shards
+shards = Shards(Path(sys.argv[1]), "b")
+before = set(os.listdir("/proc/self/task"))
+assert len(shards.states()) == 2000
+print(len(set(os.listdir("/proc/self/task")) - before))
+"""
+    line = [sys.executable, "-c", text, str(tmp_path)]
+    assert subprocess.check_output(line, text=True) == "0\n"
 
 
 def test_a_result_beats_a_failure_and_a_later_failure_an_earlier_one(tmp_path: Path) -> None:

@@ -185,7 +185,18 @@ def test_one_line_names_the_most_important_parameters_of_the_first_result(campai
     plan = campaigns.plan(DESIGN.format("random", 40))
     rows = campaigns.rows_of(plan, lambda gain, omega: -gain)
     line = most_important(summarised(plan, rows), rows)
-    assert line.startswith("y depends most on case.gain (rank correlation -1, -1 to -1), case.nat")
+    # the interval of the other parameter, which has no effect, contains 0
+    assert line == "y depends most on case.gain (rank correlation -1, -1 to -1)"
+    rows = campaigns.rows_of(plan, lambda gain, omega: math.sin(1e5 * gain))
+    line = most_important(summarised(plan, rows), rows)
+    assert line == "y: each rank correlation has an interval that contains 0"
+    points = [replace(row, values=row.values | {"case.delay_s": 0.01}) for row in rows]
+    several = summarised(plan, points) | {"sensitivities": [
+        {"result": "y", "group": "delay_s = 0.01", "parameter": "case.gain",
+         "correlation": {"value": 0.9, "ci95": None}}]}  # fmt: skip
+    line = most_important(several, points)
+    assert line == ("y at delay_s = 0.01 (first point of the axes) depends most on case.gain (rank "
+                    "correlation 0.9)")  # fmt: skip
     few = rows[:4]
     assert most_important({"sensitivities": []}, few) == ""
 

@@ -100,12 +100,18 @@ def _meaning(summary: Mapping[str, Any]) -> str:
             "All points of a grid, computed once each. Its shares of cases are not probabilities, "
             "so quantiles have no intervals."
         )
-    return (
-        "Intervals are of 95 %, from order statistics; a dash "
-        "means that there are too few cases, or that cases share drawn values or noise. Intervals "
-        "take the cases as independent draws; points of a Sobol or Latin hypercube design are "
-        "spread more evenly, which makes the intervals too wide."
+    text = (
+        "Intervals are of 95 %: those of quantiles and median differences are from order "
+        "statistics, those of coverage by Clopper and Pearson, those of rank correlations by "
+        "Fisher's transformation, and those of Sobol indices from resampling. A dash means that "
+        "there are too few cases, or that cases share drawn values or noise."
     )
+    if summary["design"]["kind"] in ("sobol", "latin-hypercube"):
+        text += (
+            " Intervals take the cases as independent draws; points of this design are spread "
+            "more evenly, which makes the intervals too wide."
+        )
+    return text
 
 
 def _left_out(values: Values, over: Sequence[Mapping[str, Any]]) -> str:

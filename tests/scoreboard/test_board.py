@@ -159,6 +159,15 @@ def test_a_kind_without_design_or_default_is_refused(installed):
     assert "no-default" not in names and {"force", "pid", "their-feed-forward"} <= set(names)
 
 
+def test_a_kind_that_alternates_is_told_to_play_the_task_with_a_drive_of_both_signs():
+    kind, loop = CONTROLLERS.find("alternating"), CLASSES["host-100hz"]
+    reason = designed(kind, loop, true_actuator(HZ)).reason
+    assert reason == (
+        "no design: the controller needs a drive of both signs. Use the task T6-bipolar."
+    )
+    assert designed(kind, loop, true_actuator(find_device("bipolar"))).chosen is not None
+
+
 def test_the_results_do_not_depend_on_the_number_of_processes():
     known = true_actuator(HZ)
     entries = [Entry("open-loop", loop, "hz") for loop in ("host-100hz", "chip-1khz")]

@@ -32,7 +32,7 @@ _CONNECT_S = 20.0
 _LEAST_SLOTS = 1  # while workers are still coming, so that an adaptive cluster sees work
 _GRACE_S = 5.0
 # Of a local cluster, whose scheduler and workers share the cores with the cases: no sampling of
-# Python stacks, and fewer looks at memory and load. Dask's own values cost about 20 % of the time.
+# Python stacks, and fewer looks at memory and load. Dask's own values cost XXX of the processor time.
 # A worker returns memory to the system when it can spare 256 MB; at Dask's 64 kB, each case of 4 ms
 # fetches 100 pages again (2 otherwise), which costs up to 10 % of its time.
 _LOCAL_CONFIG = {
@@ -148,8 +148,8 @@ class DaskExecutor:
             self._close_cluster()
             if address == LOCAL:
                 raise DeviceError(
-                    f"Dask could not start its workers on this computer ({text_of(error)}). A "
-                    "script that computes cases with Dask needs if __name__ == '__main__'."
+                    f"Dask could not start its workers on this computer ({text_of(error)}). Run "
+                    "the campaign without --scheduler, by processes."
                 ) from None
             raise InputError(
                 f"No Dask scheduler answers at {address} ({text_of(error)}). Start one with 'dask "

@@ -80,7 +80,7 @@ class _Controller(CaseKind):
         known = known_in_class(_known(task.device), find_device(task.device), loop)
         design = _design(case.controller, case.loop, task.device)
         if design.chosen is None:
-            raise ResultError(f"The controller has no design: {design.reason}")
+            raise ResultError(f"Controller {case.controller!r} has {design.reason}")
         scenario = task.scenario(known, rng)
         scenario = replace(scenario, device=replace(scenario.device, config=twin_of(inputs)))
         trace = play(scenario, design.chosen, loop, known, rng)
@@ -110,7 +110,7 @@ def _design(controller: str, loop: str, device: str) -> Designed:
     try:
         return designed(CONTROLLERS.find(controller), CLASSES[loop], known)
     except HaselabError as error:
-        return Designed(None, str(error))
+        return Designed(None, f"no design: {error}")
 
 
 CONTROLLER = _Controller()

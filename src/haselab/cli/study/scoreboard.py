@@ -73,9 +73,10 @@ def command(
 ) -> None:
     """Play controllers against tasks on simulated devices.
 
-    Each controller is designed from a model that is identified from a simulated record. It plays
-    each task. The scores are computed from the true length of the actuator, and compared with what
-    is physically possible.
+    Each controller is designed from a model that is identified from a simulated record, except pi,
+    which has the gains of the paper, and network, which was trained. Each controller plays each
+    task. The scores are computed from the true length of the actuator, and compared with what is
+    physically possible.
     """
     if out is None:
         raise click.UsageError("Missing option '--out': the folder of the results.")

@@ -32,7 +32,8 @@ _CONNECT_S = 20.0
 _LEAST_SLOTS = 1  # while workers are still coming, so that an adaptive cluster sees work
 _GRACE_S = 5.0
 # Of a local cluster, whose scheduler and workers share the cores with the cases: no sampling of
-# Python stacks, and fewer looks at memory and load. Dask's own values cost XXX of the processor time.
+# Python stacks, and fewer looks at memory and load. With Dask's own values, two workers took 2 %
+# more processor time for 2,500 cases of 7 ms (Dask 2026.8).
 # A worker returns memory to the system when it can spare 256 MB; at Dask's 64 kB, each case of 4 ms
 # fetches 100 pages again (2 otherwise), which costs up to 10 % of its time.
 _LOCAL_CONFIG = {

@@ -211,8 +211,8 @@ def _lines(found: Progressed, out: Path, important: str) -> list[str]:
     if found.computed:
         workers = "1 worker" if found.workers == 1 else f"{found.workers} workers"
         lines.append(
-            f"{found.computed:,} computed in {found.wall_s:.1f} s by {workers}, "
-            f"busy for {100.0 * (found.efficiency or 0.0):.0f} % of the time"
+            f"{found.computed:,} computed in {found.wall_s:.1f} s by {workers}; the cases took "
+            f"{100.0 * (found.efficiency or 0.0):.0f} % of the workers' time"
         )
     if found.elsewhere:
         lines.append(f"{found.elsewhere:,} are being computed by another program")

@@ -140,10 +140,11 @@ def _reasons(game: Game) -> list[str]:
 
 def _table(rows: list[Row]) -> list[str]:
     """The rows as aligned text."""
-    head = ("task", "metric", "class", "controller", "median", "worst", "bound", "ratio", "viol.")
+    head = ("task", "metric", "unit", "class", "controller", "median", "worst", "bound", "ratio",
+            "viol.")  # fmt: skip
     cells = [head] + [
-        (row.task, row.metric, row.loop, row.controller, _text(row.median), _text(row.worst),
-         "" if row.bound is None else f"{row.bound:.4g}",
+        (row.task, row.metric, row.unit, row.loop, row.controller, _text(row.median),
+         _text(row.worst), "" if row.bound is None else f"{row.bound:.4g}",
          "" if row.ratio_to_bound is None else f"{row.ratio_to_bound:.2f}", str(row.violations))
         for row in sorted(rows, key=lambda row: (row.task, row.metric, row.loop))
     ]  # fmt: skip
@@ -155,4 +156,4 @@ def _table(rows: list[Row]) -> list[str]:
 
 
 def _text(value: float | None) -> str:
-    return "not done" if value is None else f"{value:.4g}"
+    return "not reached" if value is None else f"{value:.4g}"

@@ -106,7 +106,7 @@ def test_a_choice_of_numbers_has_a_rank_and_one_of_texts_is_named(campaigns: Any
     assert [one["parameter"] for one in summary["sensitivities"]] == [
         "case.natural_frequency_rad_s"
     ]
-    assert "leave out case.gain, whose values are no numbers" in campaign_page(summary, {})
+    assert "leave out case.gain, whose values are not numbers" in campaign_page(summary, {})
 
 
 @pytest.mark.parametrize("factor", [1e200, 1e-200, 1e307, 1.0])
@@ -151,7 +151,7 @@ def test_infinite_results_differ_from_those_without_a_value(campaigns: Any) -> N
     rows[2] = replace(rows[2], results={})
     summary = summarised(plan, rows)
     page = campaign_page(summary, {})
-    assert "<td>not reached</td>" in page and "<td>−infinite</td>" in page
+    assert "<td>not reached</td>" in page and "<td>−infinity</td>" in page
     written = json.loads(json_text(with_infinities(summary)))["distributions"][0]
     assert (written["least"], written["largest"], written["mean"]) == ("-inf", "inf", None)
     assert written["without_value"] == 1

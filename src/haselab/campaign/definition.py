@@ -38,8 +38,12 @@ class Design(Section):
     samples: int | None = Field(
         None, ge=1, description="points drawn from the distributions, for each point of the axes"
     )
-    repeats: int = Field(1, ge=1, description="of each point, with other random numbers")
-    same_noise: bool = Field(False, description="give all points of the axes the same noise")
+    repeats: int = Field(
+        1, ge=1, description="computations of each point, each with other random numbers"
+    )
+    same_noise: bool = Field(
+        False, description="give all points of the axes the same random numbers"
+    )
 
 
 class _File(Section):
@@ -47,12 +51,14 @@ class _File(Section):
 
     name: str = Field(description="title of the report", examples=["tolerance of the PI loop"])
     kind: str = Field(description="what a case computes", examples=["transfer"])
-    seed: int = Field(0, ge=0, lt=2**63, description="of all random numbers")
-    base: dict[str, str] = Field({}, description="files that the cases start from, or built-in")
+    seed: int = Field(0, ge=0, lt=2**63, description="seed of all random numbers")
+    base: dict[str, str] = Field(
+        {}, description="files that the cases start from, or built-in names"
+    )
     case: dict[str, Any] = Field({}, description="settings of the kind")
     parameters: dict[str, Any] = Field({}, description="axes and distributions")
     time_limit_s: float | None = Field(
-        None, gt=0, le=1e7, description="of a case, which fails if it takes longer; default: none"
+        None, gt=0, le=1e7, description="longest time of a case, in s; a case that exceeds it fails"
     )
     design: Design = Design()
 

@@ -1,7 +1,7 @@
 """Compute cases by Dask: on the workers of a scheduler, or of a local cluster.
 
-Dask only computes. What it returns is written by the program that submitted it, so a scheduler or a
-worker that vanishes costs the cases in work and nothing else.
+Dask only computes. The program that submitted the cases writes what Dask returns. If a scheduler or
+a worker is lost, only the cases that were being computed are lost.
 """
 
 from __future__ import annotations

@@ -89,10 +89,10 @@ def command(
 ) -> None:
     """Compute many cases over parameters and seeds.
 
-    CAMPAIGN is a TOML file: what a case computes, from which twin and study, and which parameters
-    are varied how. Each finished case is kept in --out. After Ctrl-C, a failure of the computer or
-    a lost scheduler, the same command continues. Several programs with the same --out share the
-    work.
+    CAMPAIGN is a TOML file. It says what a case computes, from which twin and study, which
+    parameters vary, and how. Each finished case is kept in --out. After Ctrl-C, a failure of the
+    computer or the loss of a scheduler, the same command continues. Several programs with the same
+    --out share the work.
     """
     if index is not None:
         if out is not None or other is not None or scheduler is not None or retry_failed:

@@ -47,7 +47,7 @@ _USUAL_CLASSES = ("host-100hz", "chip-1khz", "oracle")
 @click.option(
     "--class", "classes", multiple=True, type=click.Choice(list(CLASSES)),
     help="Play in this class of loop; repeat the option for several. host: on a computer; chip: on "
-    "the microcontroller; oracle: with the true law, not ranked. Default: all classes.",
+    "the microcontroller; oracle: with the true physical model, not ranked. Default: all classes.",
 )  # fmt: skip
 @shared_option("--seed", type=SEED, default=1, show_default=True)
 @click.option(

@@ -90,7 +90,7 @@ def answer_options(
     out_detail: str = "It is a JSON file. Default: none.",
     *,
     plot: bool = False,
-    force_help: str = "Move an existing result to NAME.previous-1 instead of refusing to write.",
+    force_detail: str = "Without this option, the command refuses to write.",
 ) -> Callable[[F], F]:
     """Add `--json`, `--out`, `--force` and `--debug` (passed on as `as_json`, `out`, `debug`).
 
@@ -98,13 +98,14 @@ def answer_options(
         rule: what the command does about existing results; None: `--out` must be new.
         out_detail: what the command writes to `--out`.
         plot: add `--plot` too (passed on as `plot`).
-        force_help: help of `--force`.
+        force_detail: what `--force` does in particular; follows the common help text.
     Returns:
         The decorator.
     """
     rule = rule or OutputRule()
     if plot:
         rule = replace(rule, options=(*rule.options, "plot"))
+    force_help = f"Move an existing result to NAME.previous-1. {force_detail}"
 
     def decorate(function: F) -> F:
         @click.option("--json", "as_json", is_flag=True, help="Print one JSON document.")

@@ -74,7 +74,7 @@ __all__ = ["command"]
     OutputRule(lambda parameters: "joined" if parameters.get("index") is None else "last"),
     "It is a folder for the finished cases and the results; a campaign in it continues. "
     "Default: none; required without --case.",
-    force_help="Move the folder to NAME.previous-1 and start again.",
+    force_detail="The campaign starts again.",
 )
 def command(
     campaign: Path,

@@ -79,7 +79,7 @@ def rows(seeds: int = 1, whole: bool = False) -> Iterator[Row]:
 
 
 def _text(value: float | None) -> str:
-    return "not done" if value is None else f"{value:.3g}"
+    return "not reached" if value is None else f"{value:.3g}"
 
 
 def main() -> None:

@@ -333,4 +333,4 @@ def test_a_kind_of_another_package_is_checked_when_it_is_found() -> None:
     class Mine(type(GEOMETRY)):
         name, ignored = "mine", "twin.camera"
 
-    assert fault(Mine(), "mine") == "what it ignores is no tuple of texts"
+    assert fault(Mine(), "mine") == "its attribute ignored is not a tuple of texts"

@@ -87,7 +87,19 @@ def test_sobol_indices_of_few_blocks_have_no_interval(
     summary = summarised(plan, campaigns.rows_of(plan, lambda a, b, c: a + b * c))
     found = [one[index]["ci95"] for one in summary["sensitivities"] for index in ("first", "total")]
     assert len(found) == 6 and all((each is not None) == given for each in found)
-    assert "Sensitivity: Sobol indices" in campaign_page(summary, {})
+    page = campaign_page(summary, {})
+    assert "Sensitivity: Sobol indices" in page
+    assert "spread more evenly" not in page  # no interval of this page is of such a design
+
+
+@pytest.mark.parametrize(("kind", "even"), [("random", False), ("latin-hypercube", True)])
+def test_the_page_warns_of_wide_intervals_where_points_are_spread_evenly(
+    campaigns: Any, kind: str, even: bool
+) -> None:
+    plan = campaigns.plan(UNIFORM.format(64).replace("saltelli", kind))
+    page = campaign_page(summarised(plan, campaigns.rows_of(plan, lambda a, b, c: a)), {})
+    assert ("spread more evenly" in page) == even
+    assert "those of rank correlations by Fisher" in page
 
 
 def test_a_grid_has_its_results_over_each_axis_and_both(campaigns: Any) -> None:

@@ -178,7 +178,7 @@ def test_a_folder_of_another_campaign_is_refused_and_says_what_differs(campaigns
     assert sorted(path.name for path in (campaigns.folder / "out").rglob("*")) == before
     (campaigns.folder / "mine").mkdir()
     (campaigns.folder / "mine" / "notes.txt").write_text("mine")
-    with pytest.raises(InputError, match=r"not empty and holds no campaign.*mine"):
+    with pytest.raises(InputError, match=r"not empty and has no campaign.*mine"):
         campaigns.run("mine")
 
 

@@ -106,7 +106,7 @@ def test_a_choice_of_numbers_has_a_rank_and_one_of_texts_is_named(campaigns: Any
     assert [one["parameter"] for one in summary["sensitivities"]] == [
         "case.natural_frequency_rad_s"
     ]
-    assert "leave out case.gain, whose values are no numbers" in campaign_page(summary, {})
+    assert "leave out case.gain, whose values are not numbers" in campaign_page(summary, {})
 
 
 @pytest.mark.parametrize("factor", [1e200, 1e-200, 1e307, 1.0])
@@ -151,7 +151,7 @@ def test_infinite_results_differ_from_those_without_a_value(campaigns: Any) -> N
     rows[2] = replace(rows[2], results={})
     summary = summarised(plan, rows)
     page = campaign_page(summary, {})
-    assert "<td>not reached</td>" in page and "<td>−infinite</td>" in page
+    assert "<td>not reached</td>" in page and "<td>−infinity</td>" in page
     written = json.loads(json_text(with_infinities(summary)))["distributions"][0]
     assert (written["least"], written["largest"], written["mean"]) == ("-inf", "inf", None)
     assert written["without_value"] == 1
@@ -185,7 +185,18 @@ def test_one_line_names_the_most_important_parameters_of_the_first_result(campai
     plan = campaigns.plan(DESIGN.format("random", 40))
     rows = campaigns.rows_of(plan, lambda gain, omega: -gain)
     line = most_important(summarised(plan, rows), rows)
-    assert line.startswith("y depends most on case.gain (rank correlation -1, -1 to -1), case.nat")
+    # the interval of the other parameter, which has no effect, contains 0
+    assert line == "y depends most on case.gain (rank correlation -1, -1 to -1)"
+    rows = campaigns.rows_of(plan, lambda gain, omega: math.sin(1e5 * gain))
+    line = most_important(summarised(plan, rows), rows)
+    assert line == "y: each rank correlation has an interval that contains 0"
+    points = [replace(row, values=row.values | {"case.delay_s": 0.01}) for row in rows]
+    several = summarised(plan, points) | {"sensitivities": [
+        {"result": "y", "group": "delay_s = 0.01", "parameter": "case.gain",
+         "correlation": {"value": 0.9, "ci95": None}}]}  # fmt: skip
+    line = most_important(several, points)
+    assert line == ("y at delay_s = 0.01 (first point of the axes) depends most on case.gain (rank "
+                    "correlation 0.9)")  # fmt: skip
     few = rows[:4]
     assert most_important({"sensitivities": []}, few) == ""
 

@@ -6,6 +6,7 @@ import json
 import math
 import re
 import time
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -157,6 +158,31 @@ def test_a_kind_without_design_or_default_is_refused(installed):
         entering_kinds(("no-default",))
     names = [kind.name for kind in entering_kinds()]
     assert "no-default" not in names and {"force", "pid", "their-feed-forward"} <= set(names)
+
+
+def test_the_page_explains_every_metric_with_its_unit():
+    """A row of the table is for one task, several, all kinds of T8, or all tasks."""
+    path = Path(__file__).resolve().parents[2] / "docs" / "control" / "scoreboard.md"
+    rows = re.findall(r"^\| (.+?) \| `(\w+)` \| (.*?) ?\| (.*) \|$", path.read_text("utf-8"), re.M)
+    told = set()
+    for tasks, *metric in rows:
+        names = TASKS if tasks == "all" else re.findall(r"`([^`]+)`", tasks)
+        for name in names:
+            several = [task for task in TASKS if task.startswith("T8-")] if "*" in name else [name]
+            told |= {(task, *metric) for task in several}
+    assert told == {
+        (task.name, metric.name, metric.unit, metric.title)
+        for task in TASKS.values() for metric in task.metrics
+    }  # fmt: skip
+
+
+def test_a_kind_that_alternates_is_told_to_play_the_task_with_a_drive_of_both_signs():
+    kind, loop = CONTROLLERS.find("alternating"), CLASSES["host-100hz"]
+    reason = designed(kind, loop, true_actuator(HZ)).reason
+    assert reason == (
+        "no design: the controller needs a drive of both signs. Use the task T6-bipolar."
+    )
+    assert designed(kind, loop, true_actuator(find_device("bipolar"))).chosen is not None
 
 
 def test_the_results_do_not_depend_on_the_number_of_processes():

@@ -6,6 +6,7 @@ import copy
 import hashlib
 import json
 import math
+import re
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -18,7 +19,8 @@ from haselab.campaign.kinds.case_kind import CASE_KINDS, CaseKind, Inputs
 from haselab.store.toml import Section, read_toml, validated
 
 __all__ = [
-    "MOST_CASES", "Axis", "Campaign", "Design", "Distribution", "load_campaign", "with_values",
+    "MOST_CASES", "Axis", "Campaign", "Design", "Distribution", "load_campaign", "refused_value",
+    "with_values",
 ]  # fmt: skip
 
 MOST_CASES = 1_000_000
@@ -36,8 +38,12 @@ class Design(Section):
     samples: int | None = Field(
         None, ge=1, description="points drawn from the distributions, for each point of the axes"
     )
-    repeats: int = Field(1, ge=1, description="of each point, with other random numbers")
-    same_noise: bool = Field(False, description="give all points of the axes the same noise")
+    repeats: int = Field(
+        1, ge=1, description="computations of each point, each with other random numbers"
+    )
+    same_noise: bool = Field(
+        False, description="give all points of the axes the same random numbers"
+    )
 
 
 class _File(Section):
@@ -45,12 +51,14 @@ class _File(Section):
 
     name: str = Field(description="title of the report", examples=["tolerance of the PI loop"])
     kind: str = Field(description="what a case computes", examples=["transfer"])
-    seed: int = Field(0, ge=0, lt=2**63, description="of all random numbers")
-    base: dict[str, str] = Field({}, description="files that the cases start from, or built-in")
+    seed: int = Field(0, ge=0, lt=2**63, description="seed of all random numbers")
+    base: dict[str, str] = Field(
+        {}, description="files that the cases start from, or built-in names"
+    )
     case: dict[str, Any] = Field({}, description="settings of the kind")
     parameters: dict[str, Any] = Field({}, description="axes and distributions")
     time_limit_s: float | None = Field(
-        None, gt=0, le=1e7, description="of a case, which fails if it takes longer; default: none"
+        None, gt=0, le=1e7, description="longest time of a case, in s; a case that exceeds it fails"
     )
     design: Design = Design()
 
@@ -97,6 +105,7 @@ class Campaign:
         design: of the points.
         time_limit_s: of a case; None: no limit. The hash of a case does not include it, so it can
             be changed before failed cases are computed again.
+        source: path of the file, for messages.
     """
 
     name: str
@@ -107,6 +116,7 @@ class Campaign:
     distributions: tuple[Distribution, ...]
     design: Design
     time_limit_s: float | None = None
+    source: str = ""
 
     @property
     def paths(self) -> tuple[str, ...]:
@@ -169,7 +179,7 @@ def load_campaign(path: Path) -> Campaign:
     try:
         return _checked(file, path)
     except InputError as error:
-        raise InputError(f"{error} {path}") from None
+        raise InputError(f"{str(error).rstrip()} {path}") from None
 
 
 def _checked(file: _File, path: Path) -> Campaign:
@@ -178,10 +188,11 @@ def _checked(file: _File, path: Path) -> Campaign:
     tables = {"case": case, **_base(file.base, kind, path.parent)}
     axes, distributions = _parameters(file.parameters)
     for key in _paths(axes, distributions):
-        _refuse_unknown(key, tables)
-        _refuse_ignored(key, kind.name, kind.ignored)
+        _refuse_unknown(key, tables, kind)
+        _refuse_ignored(key, repr(kind.name), kind.ignored)
     found = Campaign(
-        file.name, file.kind, file.seed, tables, axes, distributions, file.design, file.time_limit_s
+        file.name, file.kind, file.seed, tables, axes, distributions, file.design,
+        file.time_limit_s, str(path),
     )  # fmt: skip
     _check_design(found)
     kind.check(Inputs(tables))
@@ -190,7 +201,7 @@ def _checked(file: _File, path: Path) -> Campaign:
             _check_value(found, axis.path, value)
     ignored = _ignored_everywhere(found)
     for key in _paths(axes, distributions):
-        _refuse_ignored(key, kind.name, ignored)
+        _refuse_ignored(key, f"{kind.name!r} with this [case]", ignored)
     return found
 
 
@@ -341,11 +352,11 @@ def with_values(
 
     Args:
         tables: by name.
-        values: by their dotted paths; a number in a path is a place in a list.
+        values: by their dotted paths; a number in a path is an index of a list, from 0.
     Returns:
         The changed copies.
     Raises:
-        InputError: a path leads through something that is no table.
+        InputError: a path leads through something that is not a table.
     Example:
         >>> with_values({"twin": {"load": {"mass_kg": 0.25}}}, {"twin.load.mass_kg": 0.3})
         {'twin': {'load': {'mass_kg': 0.3}}}
@@ -354,47 +365,57 @@ def with_values(
     for path, value in values.items():
         *way, last = path.split(".")
         inner: Any = found
-        for part in way:
-            inner = _inside(inner, part, path)
-        if isinstance(inner, list):
-            _inside(inner, last, path)
-            inner[int(last)] = value
-        elif isinstance(inner, dict):
+        for k, part in enumerate(way):
+            inner = _inside(inner, part, ".".join(way[:k]))
+        if isinstance(inner, dict):
             inner[last] = value
         else:
-            raise InputError(f"parameters.{path}: {way[-1]} is a value, not a table.")
+            _inside(inner, last, ".".join(way))
+            inner[int(last)] = value
     return found
 
 
-def _inside(table: Any, part: str, path: str) -> Any:
+def _inside(table: Any, part: str, parent: str) -> Any:
+    path = f"{parent}.{part}"
     if isinstance(table, list):
-        if part not in map(str, range(len(table))):  # only one way to write a place
+        if part not in map(str, range(len(table))):  # only one way to write an index
             raise InputError(
-                f"parameters.{path}: {part!r} is not a place in a list of {len(table)} values. "
-                "Places count from 0."
+                f"parameters.{path}: {part!r} is not an index of a list of {len(table)} values. "
+                f"Use 0 to {len(table) - 1}."
             )
         return table[int(part)]
-    if not isinstance(table, dict) or part not in table:
-        names = ", ".join(map(str, table)) if isinstance(table, dict) else "none"
-        raise InputError(f"parameters.{path}: there is no table {part!r}; the tables and keys are "
-                         f"{names}.")  # fmt: skip
+    if not isinstance(table, dict):
+        raise InputError(  # as with a distribution that is spelt wrong
+            f"parameters.{parent}: unknown key {part!r}. Use one of {', '.join(_SHAPES)}."
+        )
+    if part not in table:
+        raise InputError(
+            f"parameters.{path}: there is no table {part!r}. Use one of {', '.join(table)}."
+        )
     return table[part]
 
 
-def _refuse_unknown(path: str, tables: Mapping[str, JsonObject]) -> None:
+def _refuse_unknown(path: str, tables: Mapping[str, JsonObject], kind: CaseKind) -> None:
     first, _, rest = path.partition(".")
-    if first not in tables or not rest:
+    names = " or ".join(f"{name}." for name in tables)
+    if first not in tables:
         raise InputError(
-            f"parameters.{path} is no key of {' or '.join(tables)}. Begin it with one of "
-            f"{', '.join(f'{name}.' for name in tables)}."
+            f"parameters.{path}: a campaign of the kind {kind.name!r} has no table {first!r}. "
+            f"Begin the path with {names}"
         )
+    if not rest:
+        raise InputError(
+            f"parameters.{path} is a table, not a key. Name one of its keys: "
+            f"{', '.join(tables[first])}."
+        )
+    with_values(tables, {path: None})
 
 
 def _refuse_ignored(path: str, kind: str, ignored: Sequence[str]) -> None:
     if any(path == key or path.startswith(f"{key}.") for key in ignored):
         raise InputError(
-            f"parameters.{path} has no effect on cases of the kind {kind!r} with this [case]. "
-            "Remove it, or change the kind or [case]."
+            f"parameters.{path} has no effect on cases of the kind {kind}. Remove it, or choose "
+            "another kind."
         )
 
 
@@ -403,7 +424,24 @@ def _check_value(campaign: Campaign, path: str, value: Json) -> None:
     try:
         campaign.case_kind.check(Inputs(with_values(campaign.tables, {path: value})))
     except InputError as error:
-        raise InputError(f"{path} = {value!r}: {error}") from None
+        raise InputError(refused_value(path, value, error, "Change it.")) from None
+
+
+def refused_value(path: str, value: Json, error: InputError, advice: str) -> str:
+    """Say why a value of a parameter is refused, in one cause and one action.
+
+    Args:
+        path: of the parameter.
+        value: that is refused.
+        error: of the check of the tables with this value.
+        advice: what to do if the error names only this parameter.
+    """
+    own = re.fullmatch(rf"1 error: {re.escape(path)}: (.*)\. Change these values\. *", str(error))
+    if own is None:
+        return f"parameters.{path} = {value!r}: {str(error).rstrip()}"
+    if own[1].startswith("no such key"):
+        return f"parameters.{path}: {own[1].partition(' (got')[0]}. Change it."
+    return f"parameters.{path}: {own[1]}. {advice}"
 
 
 # ---- design ------------------------------------------------------------------------------------

@@ -67,7 +67,7 @@ def open_folder(plan: Plan, folder: Path) -> None:
         )
         if others and not (folder / CAMPAIGN).exists():  # another program may begin it now
             raise InputError(
-                "--out names a folder that is not empty and holds no campaign; it was not changed. "
+                "--out names a folder that is not empty and has no campaign; it was not changed. "
                 f"Name a new folder, or add --force to move this one aside. {folder}"
             )
         with contextlib.suppress(InputError):  # another program has just begun it

@@ -12,7 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from haselab.base import InputError, Json, JsonObject
-from haselab.campaign.definition import Campaign, Distribution, with_values
+from haselab.campaign.definition import Campaign, Distribution, refused_value, with_values
 from haselab.campaign.kinds.case_kind import CASE_KINDS, Inputs
 from haselab.store.optional import library
 from haselab.store.source_digest import source_digest
@@ -160,10 +160,8 @@ class Plan:
                 try:
                     kind.check(Inputs(with_values(one.tables, {about.path: value})))
                 except InputError as error:
-                    raise InputError(
-                        f"{about.path} takes the value {value!r} in a case: {error} Change its "
-                        "distribution."
-                    ) from None
+                    said = refused_value(about.path, value, error, "Change its distribution.")
+                    raise InputError(f"{said} {one.source}") from None
 
 
 def code_of(kind: str) -> str:
@@ -235,5 +233,7 @@ def _from_unit(about: Distribution, unit: Floats) -> Floats:
     else:
         values = first + unit * (second - first)
     if not np.isfinite(values).all():
-        raise InputError(f"A drawn value of {about.path} is not finite. Choose another seed.")
+        raise InputError(
+            f"parameters.{about.path}: a drawn value is not finite. Choose another seed."
+        )
     return np.asarray(values)

@@ -1,7 +1,7 @@
 """Run a campaign: the cases that are not finished, in chunks, until all of them are.
 
 The shards in the folder are the only record. The queue is all cases minus the finished ones, so a
-program that starts again, or beside another one, continues where the folder is.
+program that starts again, or while another one is running, continues from the folder.
 """
 
 from __future__ import annotations

@@ -49,7 +49,7 @@ def sensitivities(
 
 
 def unranked_of(campaign: Campaign) -> list[str]:
-    """Parameters that are drawn from values that are no numbers, so that they have no ranks.
+    """Parameters that are drawn from values without ranks, because they are not numbers.
 
     Args:
         campaign: with them.

@@ -107,8 +107,8 @@ def most_important(summary: Mapping[str, Any], rows: Sequence[CaseRow]) -> str:
         summary: see `summarised`.
         rows: of the cases.
     Returns:
-        Up to three, the most important first, at the first point of the axes; an empty text if
-        there are no sensitivities.
+        Up to three, the most important first, at the first point of the axes. Parameters whose
+        interval contains 0 are left out. An empty text if there are no sensitivities.
     """
     order = [name for row in rows[:1000] for name in row.results]  # the order of the kind
     found = summary["sensitivities"]
@@ -118,20 +118,24 @@ def most_important(summary: Mapping[str, Any], rows: Sequence[CaseRow]) -> str:
         return ""
     found = [one for one in found if one["result"] == name]
     label = found[0]["group"]
-    listed = []
+    place = f" at {label} (first point of the axes)" if label else ""
+    is_sobol = "total" in found[0]
+    kind, key = (
+        ("total Sobol index", "total") if is_sobol else ("rank correlation", "correlation")
+    )  # fmt: skip
+    listed, unclear = [], False
     for one in found:
-        kind, number = (
-            ("total Sobol index", one["total"]) if "total" in one
-            else ("rank correlation", one["correlation"])
-        )  # fmt: skip
+        number = one[key]
         if one["group"] == label and not math.isnan(number["value"]):
             ends = number["ci95"]
+            if ends is not None and ends[0] <= 0.0 <= ends[1]:
+                unclear = True
+                continue
             near = "" if ends is None else f", {ends[0]:.2g} to {ends[1]:.2g}"
             text = f"{one['parameter']} ({kind} {number['value']:.2g}{near})"
             listed.append((-abs(number["value"]), text))
     if not listed:
-        return ""
-    place = f" at {label}" if label else ""
+        return f"{name}{place}: each {kind} has an interval that contains 0" if unclear else ""
     return f"{name}{place} depends most on {', '.join(text for _, text in sorted(listed)[:3])}"
 
 

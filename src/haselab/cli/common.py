@@ -90,6 +90,7 @@ def answer_options(
     out_detail: str = "It is a JSON file. Default: none.",
     *,
     plot: bool = False,
+    force_detail: str = "Without this option, the command refuses to write.",
 ) -> Callable[[F], F]:
     """Add `--json`, `--out`, `--force` and `--debug` (passed on as `as_json`, `out`, `debug`).
 
@@ -97,18 +98,19 @@ def answer_options(
         rule: what the command does about existing results; None: `--out` must be new.
         out_detail: what the command writes to `--out`.
         plot: add `--plot` too (passed on as `plot`).
+        force_detail: what `--force` does in particular; follows the common help text.
     Returns:
         The decorator.
     """
     rule = rule or OutputRule()
     if plot:
         rule = replace(rule, options=(*rule.options, "plot"))
-    text = "Move an existing result to NAME.previous-1 instead of refusing to write."
+    force_help = f"Move an existing result to NAME.previous-1. {force_detail}"
 
     def decorate(function: F) -> F:
         @click.option("--json", "as_json", is_flag=True, help="Print one JSON document.")
         @shared_option("--out", type=click.Path(path_type=Path), detail=out_detail)
-        @click.option("--force", is_flag=True, help=text)
+        @click.option("--force", is_flag=True, help=force_help)
         @click.option("--debug", is_flag=True, help="Show the traceback of an error.")
         @functools.wraps(function)
         def wrapper(*args: Any, debug: bool = False, force: bool = False, **kwargs: Any) -> Any:

@@ -57,8 +57,9 @@ class StrainEnv(gymnasium.Env[NDArray[np.float32], NDArray[np.float32]]):
 
     Each episode takes one of the drawn devices. The reward of an update is
     `-|strain - reference| / 0.05 - 0.05 change**2` with the true strain and the change of the
-    action, and -100 if the device breaks down, which ends the episode. The information of a step
-    has this `strain` and `reference`; the observation has the reference of the next update.
+    action. It is -100, and the episode ends, if the device breaks down or leaves the lengths in
+    which its physical model is valid. The information of a step has this `strain` and `reference`;
+    the observation has the reference of the next update.
 
     Args:
         task: `track`, `hold` or `gait`.

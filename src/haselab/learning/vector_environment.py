@@ -23,7 +23,7 @@ Flags = NDArray[np.bool_]
 class StrainVectorEnv(VectorEnv[Observed, Observed, Any]):
     """`StrainEnv` many times over, stepped in one call of the compiled twin.
 
-    An episode that has ended begins anew with the next step, whose action it ignores and whose
+    An episode that has ended starts again in the next step, whose action it ignores and whose
     reward is 0 (`AutoresetMode.NEXT_STEP`).
 
     Args:

@@ -75,14 +75,14 @@ def _about(summary: Mapping[str, Any]) -> str:
     if summary["failed"] > _MANY * summary["cases"]:
         parts.append(
             f"{summary['failed']:,} of {summary['cases']:,} cases failed. All distributions, "
-            "medians and sensitivities are those of the other cases, which may differ from all: "
-            "see the parameters of the failed cases."
+            "medians and sensitivities are those of the other cases, which may not represent all "
+            "cases: see the parameters of the failed cases."
         )
     if unused := summary.get("without_effect", ()):
         parts.append(f"No result depends on {', '.join(unused)}.")
     if unranked := summary["unranked"]:
         parts.append(
-            f"The sensitivities leave out {', '.join(unranked)}, whose values are no numbers."
+            f"The sensitivities leave out {', '.join(unranked)}, whose values are not numbers."
         )
     if exact := summary.get("without_noise", ()):
         parts.append(
@@ -90,22 +90,30 @@ def _about(summary: Mapping[str, Any]) -> str:
             "intervals are only as wide as rounding errors."
         )
     if summary["is_random"] and not summary["sensitivities"]:
-        parts.append("There are no sensitivities: too few cases have a value, or none changes.")
+        parts.append(
+            "There are no sensitivities: too few cases have a value, or no result changes."
+        )
     return " ".join(parts)
 
 
 def _meaning(summary: Mapping[str, Any]) -> str:
     if not summary["is_random"]:
         return (
-            "All points of a grid, computed once each. Its shares of cases are not probabilities, "
-            "so quantiles have no intervals."
+            "Each point of the grid was computed once. Shares of these cases are not "
+            "probabilities, so quantiles have no intervals."
         )
-    return (
-        "Intervals are of 95 %, from order statistics; a dash "
-        "means that there are too few cases, or that cases share drawn values or noise. Intervals "
-        "take the cases as independent draws; points of a Sobol or Latin hypercube design are "
-        "spread more evenly, which makes the intervals too wide."
+    text = (
+        "Intervals are of 95 %: those of quantiles and median differences are from order "
+        "statistics, those of coverage by Clopper and Pearson, those of rank correlations by "
+        "Fisher's transformation, and those of Sobol indices from resampling. A dash means that "
+        "there are too few cases, or that cases share drawn values or noise."
     )
+    if summary["design"]["kind"] in ("sobol", "latin-hypercube"):
+        text += (
+            " Intervals take the cases as independent draws; points of this design are spread "
+            "more evenly, which makes the intervals too wide."
+        )
+    return text
 
 
 def _left_out(values: Values, over: Sequence[Mapping[str, Any]]) -> str:
@@ -150,20 +158,20 @@ def _shares(values: Floats, label: str) -> Curve:
 def _tables(summary: Mapping[str, Any]) -> Iterator[_Table]:
     yield _Table(
         "Parameters", f"Varied parameters. {_settings(summary)}",
-        ("Parameter", "Values", "How"),
+        ("Parameter", "Values", "Kind"),
         [
             (path, _listed(numbers), shape)
             for path, chosen in summary["parameters"].items()
             for shape, numbers in (
                 chosen.items() if isinstance(chosen, Mapping) else [("axis", chosen)]
             )
-        ] or [(ABSENT, ABSENT, "repeats only")],
+        ] or [(ABSENT, ABSENT, "only repeats")],
     )  # fmt: skip
     yield from _sensitivities(summary["sensitivities"])
     yield _Table(
-        "Results", "Numbers in brackets are intervals of 95 %.",
-        ("Result", "Axes", "Cases", "Without a value", "Smallest", "5 %", "Median", "95 %",
-         "Largest"),
+        "Results", "Intervals of 95 % are in parentheses.",
+        ("Result", "Point of the axes", "Cases", "Without a value", "Smallest", "5 %", "Median",
+         "95 %", "Largest"),
         [
             (one["result"], one["group"], str(one["count"]), str(one["without_value"]),
              _text(one.get("least")), *(_with_interval(one.get(key)) for key in
@@ -174,9 +182,10 @@ def _tables(summary: Mapping[str, Any]) -> Iterator[_Table]:
     yield _Table(
         "Coverage of the intervals",
         "How often the stated interval of 95 % contains the true value, which the simulation knows "
-        "and the analysis does not. Good intervals contain it in 95 % of the cases. Failed cases "
-        "and those in which the estimate was not identifiable have no interval and do not count.",
-        ("Estimate", "Axes", "Cases", "Without an interval", "Inside", "Share"),
+        "and the analysis does not. Correct intervals contain it in 95 % of the cases. Failed "
+        "cases and those in which the estimate was not identifiable have no interval and do not "
+        "count.",
+        ("Estimate", "Point of the axes", "Cases", "Without an interval", "Inside", "Share"),
         [
             (one["result"], one["group"], str(one["count"]), str(one["without_interval"]),
              str(one["inside"]),
@@ -200,10 +209,10 @@ def _tables(summary: Mapping[str, Any]) -> Iterator[_Table]:
     )  # fmt: skip
     yield _Table(
         "Comparison",
-        f"This campaign against that in {summary.get('compared_with', '')}. The interval of the "
-        "difference is from resampling both; without draws there is none. Cases without a value "
-        "are left out, and so are results whose median was not reached. If both campaigns have the "
-        "same cases, only those with a value in both count. "
+        f"This campaign compared with that in {summary.get('compared_with', '')}. The interval of "
+        "the difference comes from resampling both; without random draws there is none. Cases "
+        "without a value are left out, and so are results whose median was not reached. If both "
+        "campaigns have the same cases, only those with a value in both count. "
         f"{_differences(summary)}",
         ("Result", "Median here", "Median there", "Difference", "Without a value, here and there"),
         [
@@ -375,7 +384,8 @@ def _sensitivities(found: Sequence[Mapping[str, Any]]) -> Iterator[_Table]:
         "Intervals of 95 % from resampling. A block of samples in which "
         "a case has no finite value is left out; if many are, the indices are those of a part of "
         "the distributions only.",
-        ("Result", "Axes", "Parameter", "First-order index", "Total index", "Blocks", "Left out"),
+        ("Result", "Point of the axes", "Parameter", "First-order index", "Total index", "Blocks",
+         "Left out"),
         [
             (one["result"], one["group"], one["parameter"], _with_interval(one["first"]),
              _with_interval(one["total"]), str(one["blocks"]), str(one["blocks_left_out"]))
@@ -386,7 +396,7 @@ def _sensitivities(found: Sequence[Mapping[str, Any]]) -> Iterator[_Table]:
         "Sensitivity: rank correlation",
         "Spearman's correlation of a parameter and a result: 1 and −1 for a monotone relation, 0 "
         "also for one that rises and falls. A result that was not reached ranks above all others.",
-        ("Result", "Axes", "Parameter", "Correlation", "Cases", "Without a value"),
+        ("Result", "Point of the axes", "Parameter", "Correlation", "Cases", "Without a value"),
         [
             (one["result"], one["group"], one["parameter"], _with_interval(one["correlation"]),
              str(one["count"]), str(one["without_value"]))
@@ -417,7 +427,7 @@ def _with_interval(number: Mapping[str, Any] | None) -> str:
 
 def _text(value: float | None) -> str:
     if value is not None and math.isinf(value):
-        return "not reached" if value > 0.0 else "−infinite"
+        return "not reached" if value > 0.0 else "−infinity"
     return number_text(value)
 
 

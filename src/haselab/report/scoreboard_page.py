@@ -136,7 +136,7 @@ def _part(game: Game, name: str, rows: Sequence[Row]) -> _Part:
 
 
 def _number(value: float | None) -> str:
-    return "not done" if value is None else number_text(value)
+    return "not reached" if value is None else number_text(value)
 
 
 def _chart(title: str, traces: Sequence[Played]) -> Chart:

@@ -8,7 +8,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from haselab.actuators import GRAVITY_M_S2, linearise
-from haselab.base import InputError, ResultError
+from haselab.base import HaselabError, InputError, ResultError
 from haselab.base.exits import no_exit
 from haselab.control import DesignSpec, LoopSetting, Saturation, design_pid
 from haselab.control.plants.general import AnyPlant
@@ -23,6 +23,7 @@ PAPER_PI = {"kp": 0.85, "ki": 1.5}  # of the reference study
 _STEP = 1e-3  # strain, of the slope of the static drive
 _SMALL = 1e-9  # of the largest coefficient: rounding errors of the conversion
 _SEED = 1  # of the search for gains
+_ONE_SIGN = "no design: the controller needs a drive of both signs. Use the task T6-bipolar."
 
 
 @dataclass(frozen=True)
@@ -85,9 +86,13 @@ def designed(kind: ControllerKind, loop: LoopClass, known: KnownActuator) -> Des
             return Designed(kind.choose(_pid_gains(loop, known)))
         if kind.design is None:
             return Designed(kind.choose())
+        if kind.alternates and known.low_v >= 0.0:
+            return Designed(None, _ONE_SIGN)
         blank = ChosenController(kind, ())
         with no_exit():
             return Designed(kind.choose(kind.design(setting_for(blank, loop, known, 0.0))))
+    except HaselabError as error:
+        return Designed(None, f"no design: {error}")
     except Exception as error:  # a design of another package may raise anything
         return Designed(None, f"no design: {type(error).__name__}: {error}")
 

@@ -84,6 +84,18 @@ def test_a_fit_with_zeros_keeps_its_poles_and_gain(tmp_path):
         export(path, "--to", "json")
 
 
+def test_a_twin_file_is_named_and_not_called_an_actuator_file(tmp_path):
+    path = tmp_path / "my-twin.toml"
+    path.write_text('name = "my twin"\n[load]\nmass_kg = 0.2\n')
+    for words in (["export", path, "--to", "json"], ["design", path]):
+        with pytest.raises(InputError, match="is a twin file") as caught:
+            cli.main(list(map(str, words)), standalone_mode=False)
+        assert str(caught.value) == (
+            f"{path} is a twin file, which has no [model]. Name an actuator file, or export the "
+            f"twin with: haselab export {path} --to fmu --out TWIN.fmu"
+        )
+
+
 def test_what_is_no_model_is_refused(model, tmp_path):
     with pytest.raises(InputError, match="--to mat needs a file to write"):
         export(model, "--to", "mat")

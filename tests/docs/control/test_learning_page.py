@@ -14,7 +14,7 @@ def test_the_examples_of_the_page_run(
 ) -> None:
     monkeypatch.chdir(tmp_path)
     (devices,) = PAGE.toml
-    (tmp_path / "devices.toml").write_text(devices, encoding="utf-8")
+    (tmp_path / "training-devices.toml").write_text(devices, encoding="utf-8")
     names: dict[str, object] = {}
     for code in PAGE.python:
         PAGE.execute(code, names)

@@ -85,6 +85,17 @@ def test_no_page_shows_a_raw_row_of_a_table(site: Path) -> None:
     assert not raw, "\n".join(raw)
 
 
+def test_no_paragraph_becomes_a_row_of_a_table() -> None:
+    """Markdown takes each line below a table as a further row of it, up to an empty line."""
+    sources = [*(ROOT / "docs").rglob("*.md"), *ROOT.glob("[A-Z]*.md")]
+    swallowed = []
+    for path in sources:
+        text = re.sub(r"^ *```.*?^ *```$", "", path.read_text(encoding="utf-8"), flags=re.M | re.S)
+        lines = re.findall(r"^\|.*\n(?!\s*(?:\||$))(.*)", text, re.M)
+        swallowed += [f"{path.relative_to(ROOT)}: {line}" for line in lines]
+    assert not swallowed, "\n".join(swallowed)
+
+
 def test_nothing_comes_from_another_host(site: Path) -> None:
     foreign = [
         f"{page.relative_to(site)}: <{tag}> {address}"

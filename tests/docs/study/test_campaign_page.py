@@ -68,8 +68,20 @@ def test_every_example_is_a_campaign_that_can_begin(name: str) -> None:
     assert len(set(plan.hashes())) == plan.count
 
 
+def test_the_table_of_the_settings_of_transfer_has_every_key_with_its_unit_and_default() -> None:
+    part = TEXT[TEXT.index("### Settings of transfer") :]
+    rows = re.findall(r"^\| `(\w+)` \| ?(.*?) \| (.*?) \| .+ \|$", part, re.MULTILINE)
+    fields = CASE_KINDS.find("transfer").settings.model_fields
+    assert [name for name, _, _ in rows] == list(fields)
+    units = {"rad_s": "rad/s", "hz": "Hz", "s": "s"}
+    for name, unit, default in rows:
+        assert unit == next((units[end] for end in units if name.endswith(f"_{end}")), "")
+        assert default == repr(fields[name].default)
+
+
 def test_the_table_of_kinds_has_every_kind_with_its_files_and_settings() -> None:
-    rows = re.findall(r"^\| `([\w-]+)` \| (.*?) \| (.*?) \| (.*?) \|$", TEXT, re.MULTILINE)
+    part = TEXT[: TEXT.index("### Settings of transfer")]
+    rows = re.findall(r"^\| `([\w-]+)` \| (.*?) \| (.*?) \| (.*?) \|$", part, re.MULTILINE)
     found = {name: (files, settings) for name, _, files, settings in rows}
     kinds = CASE_KINDS.usable()
     assert set(found) == set(kinds)

@@ -109,11 +109,11 @@ def _fault(kind: Any, name: str) -> str:
     if kind.name != name:
         return f"its name is {kind.name!r}"
     if not (isinstance(kind.settings, type) and issubclass(kind.settings, Section)):
-        return "its settings are no class derived from Section"
+        return "its settings are not a class derived from Section"
     if not all(isinstance(each, BaseFile) for each in kind.files):
-        return "a file is no BaseFile"
+        return "a file is not a BaseFile"
     texts = isinstance(kind.ignored, tuple) and all(isinstance(key, str) for key in kind.ignored)
-    return "" if texts else "what it ignores is no tuple of texts"
+    return "" if texts else "its attribute ignored is not a tuple of texts"
 
 
 CASE_KINDS: Registry[CaseKind] = Registry(

@@ -98,7 +98,7 @@ class _Controller(CaseKind):
         known = known_in_class(_known(task.device), find_device(task.device), loop)
         design = _design(case.controller, case.loop, task.device)
         if design.chosen is None:
-            raise ResultError(f"The controller has no design: {design.reason}")
+            raise ResultError(f"Controller {case.controller!r} has {design.reason}")
         twin = twin_of(inputs)
         scenario = _scenario(task, known, twin.load.mass_kg, rng)
         scenario = replace(scenario, device=replace(scenario.device, config=twin))
@@ -144,7 +144,7 @@ def _design(controller: str, loop: str, device: str) -> Designed:
         with seeded([0]):
             return designed(CONTROLLERS.find(controller), CLASSES[loop], known)
     except HaselabError as error:
-        return Designed(None, str(error))
+        return Designed(None, f"no design: {error}")
 
 
 CONTROLLER = _Controller()

@@ -1,4 +1,4 @@
-"""Case kind `geometry`: stroke, force, bandwidth and field of a design, from its law alone."""
+"""Case kind `geometry`: stroke, force, bandwidth and field of a design, without simulation."""
 
 from __future__ import annotations
 
@@ -29,7 +29,7 @@ class GeometrySettings(Section):
         8000.0, gt=0, le=1e6, description="highest voltage at the actuator, in V"
     )
     bias_share: float = Field(
-        0.7, gt=0, lt=1, description="of that voltage, about which the bandwidth is computed"
+        0.7, gt=0, lt=1, description="share of that voltage at which the bandwidth is computed"
     )
 
 

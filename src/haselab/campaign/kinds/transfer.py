@@ -20,16 +20,20 @@ class TransferSettings(Section):
     """A linear device, and the record from which it is identified."""
 
     gain: float = Field(0.5, description="static gain of the resonance")
-    natural_frequency_rad_s: float = Field(33.0, gt=0, le=1e4)
-    damping_ratio: float = Field(0.11, gt=0, lt=1)
-    delay_s: float = Field(0.012, ge=0, le=10)
-    slow_gain: float = Field(0.0, description="static gain of a slow branch; 0: none")
-    slow_time_constant_s: float = Field(3.0, gt=0, le=1e3)
-    amplitude: float = Field(1.0, gt=0, description="of the binary excitation")
-    hold_s: float = Field(0.05, gt=0, description="shortest time between two of its changes")
-    noise_std: float = Field(0.01, ge=0, description="of each sample of the output")
-    rate_hz: float = Field(100.0, gt=0, le=1e5)
-    duration_s: float = Field(5.0, gt=0, le=1e4)
+    natural_frequency_rad_s: float = Field(33.0, gt=0, le=1e4, description="of the resonance")
+    damping_ratio: float = Field(0.11, gt=0, lt=1, description="of the resonance")
+    delay_s: float = Field(0.012, ge=0, le=10, description="of the device, in s")
+    slow_gain: float = Field(0.0, description="static gain of a slow mode; 0: none")
+    slow_time_constant_s: float = Field(3.0, gt=0, le=1e3, description="of the slow mode, in s")
+    amplitude: float = Field(1.0, gt=0, description="of the input, a random binary signal")
+    hold_s: float = Field(
+        0.05, gt=0, description="shortest time between two changes of the input, in s"
+    )
+    noise_std: float = Field(
+        0.01, ge=0, description="standard deviation of the noise of each output sample"
+    )
+    rate_hz: float = Field(100.0, gt=0, le=1e5, description="sampling rate, in Hz")
+    duration_s: float = Field(5.0, gt=0, le=1e4, description="of the record, in s")
 
 
 class _Transfer(CaseKind):

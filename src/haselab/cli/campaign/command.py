@@ -74,6 +74,7 @@ __all__ = ["command"]
     OutputRule(lambda parameters: "joined" if parameters.get("index") is None else "last"),
     "It is a folder for the finished cases and the results; a campaign in it continues. "
     "Default: none; required without --case.",
+    force_detail="The campaign starts again.",
 )
 def command(
     campaign: Path,
@@ -88,10 +89,10 @@ def command(
 ) -> None:
     """Compute many cases over parameters and seeds.
 
-    CAMPAIGN is a TOML file: what a case computes, from which twin and study, and which parameters
-    are varied how. Each finished case is kept in --out. After Ctrl-C, a failure of the computer or
-    a lost scheduler, the same command continues. Several programs with the same --out share the
-    work.
+    CAMPAIGN is a TOML file. It says what a case computes, from which twin and study, which
+    parameters vary, and how. Each finished case is kept in --out. After Ctrl-C, a failure of the
+    computer or the loss of a scheduler, the same command continues. Several programs with the same
+    --out share the work.
     """
     if index is not None:
         if out is not None or other is not None or scheduler is not None or retry_failed:
@@ -210,8 +211,8 @@ def _lines(found: Progressed, out: Path, important: str) -> list[str]:
     if found.computed:
         workers = "1 worker" if found.workers == 1 else f"{found.workers} workers"
         lines.append(
-            f"{found.computed:,} computed in {found.wall_s:.1f} s by {workers}, "
-            f"busy for {100.0 * (found.efficiency or 0.0):.0f} % of the time"
+            f"{found.computed:,} computed in {found.wall_s:.1f} s by {workers}; the cases took "
+            f"{100.0 * (found.efficiency or 0.0):.0f} % of the workers' time"
         )
     if found.elsewhere:
         lines.append(f"{found.elsewhere:,} are being computed by another program")

@@ -30,7 +30,7 @@ _OF_FMU = ("inputs", "outputs", "parameters", "constants")
     "--to", "form", type=click.Choice(["json", "mat", "plant", "fmu"]), required=True,
     detail="json: numerator and denominator; mat: the same for MATLAB's "
     "tf(num,den,'InputDelay',delay); plant: a model.json of haselab; fmu: the twin of a TWIN.toml "
-    "or of an actuator file, for simulators that know the FMI standard.",
+    "or of an actuator file, for simulators that support the FMI standard.",
 )  # fmt: skip
 @click.option(
     "--fmi", "version", type=click.Choice(FMI_VERSIONS), help="Set the version of the FMI standard "
@@ -38,7 +38,7 @@ _OF_FMU = ("inputs", "outputs", "parameters", "constants")
 )  # fmt: skip
 @shared_option(
     "--seed", type=click.IntRange(0, 2**31 - 1),
-    detail="They are the noise of the monitors; used with --to fmu only. Default: 1.",
+    detail="It determines the noise of the monitors; used with --to fmu only. Default: 1.",
 )  # fmt: skip
 @click.option(
     "--input-name", metavar="NAME", help="Set the name of the input. Default: that of the model."

@@ -47,7 +47,7 @@ _USUAL_CLASSES = ("host-100hz", "chip-1khz", "oracle")
 @click.option(
     "--class", "classes", multiple=True, type=click.Choice(list(CLASSES)),
     help="Play in this class of loop; repeat the option for several. host: on a computer; chip: on "
-    "the microcontroller; oracle: with the true law, not ranked. Default: all classes.",
+    "the microcontroller; oracle: with the true physical model, not ranked. Default: all classes.",
 )  # fmt: skip
 @shared_option("--seed", type=SEED, default=1, show_default=True)
 @click.option(
@@ -73,9 +73,10 @@ def command(
 ) -> None:
     """Play controllers against tasks on simulated devices.
 
-    Each controller is designed from a model that is identified from a simulated record. It plays
-    each task. The scores are computed from the true length of the actuator, and compared with what
-    is physically possible.
+    Each controller is designed from a model that is identified from a simulated record, except pi,
+    which has the gains of the paper, and network, which was trained. Each controller plays each
+    task. The scores are computed from the true length of the actuator, and compared with what is
+    physically possible.
     """
     if out is None:
         raise click.UsageError("Missing option '--out': the folder of the results.")
@@ -139,10 +140,11 @@ def _reasons(game: Game) -> list[str]:
 
 def _table(rows: list[Row]) -> list[str]:
     """The rows as aligned text."""
-    head = ("task", "metric", "class", "controller", "median", "worst", "bound", "ratio", "viol.")
+    head = ("task", "metric", "unit", "class", "controller", "median", "worst", "bound", "ratio",
+            "viol.")  # fmt: skip
     cells = [head] + [
-        (row.task, row.metric, row.loop, row.controller, _text(row.median), _text(row.worst),
-         "" if row.bound is None else f"{row.bound:.4g}",
+        (row.task, row.metric, row.unit, row.loop, row.controller, _text(row.median),
+         _text(row.worst), "" if row.bound is None else f"{row.bound:.4g}",
          "" if row.ratio_to_bound is None else f"{row.ratio_to_bound:.2f}", str(row.violations))
         for row in sorted(rows, key=lambda row: (row.task, row.metric, row.loop))
     ]  # fmt: skip
@@ -154,4 +156,4 @@ def _table(rows: list[Row]) -> list[str]:
 
 
 def _text(value: float | None) -> str:
-    return "not done" if value is None else f"{value:.4g}"
+    return "not reached" if value is None else f"{value:.4g}"

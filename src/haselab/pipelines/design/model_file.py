@@ -24,6 +24,7 @@ from haselab.models.plant import Plant, SlowMode
 from haselab.models.posterior import PlantPosterior
 from haselab.models.rational import RationalModel
 from haselab.pipelines.design.model_keys import refuse_unknown_keys
+from haselab.rig.twin.twin_file import is_actuator_file, load_twin
 from haselab.store.actuator_file import read_actuator, read_run
 from haselab.store.columns.mat_struct import read_mat_struct
 from haselab.store.folder import read_json
@@ -101,6 +102,11 @@ def _data(path: Path) -> Any:
             raise InputError(
                 f"[model] has {', '.join(held)}, but neither gain nor numerator. Add gain, or "
                 f"check its spelling: {path}"
+            )
+        if _is_twin(path):
+            raise InputError(
+                f"{path} is a twin file, which has no [model]. Name an actuator file, or export "
+                f"the twin with: haselab export {path} --to fmu --out TWIN.fmu"
             )
         raise InputError(f"{missing('model', 'haselab identify transfer FILE')} {path}")
     if "numerator" in table:
@@ -260,6 +266,14 @@ def _checked(model: type[_Checked], plant: Any, path: Path) -> _Checked:
 
 def _plant(table: PlantTable) -> Plant:
     return Plant.from_dict(table.model_dump())
+
+
+def _is_twin(path: Path) -> bool:
+    """Whether a TOML file describes a twin and not an actuator."""
+    try:
+        return not is_actuator_file(path) and bool(load_twin(path).model_fields_set)
+    except InputError:
+        return False
 
 
 def _plant_of(data: Any, path: Path) -> dict[str, Any]:

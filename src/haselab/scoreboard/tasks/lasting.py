@@ -118,25 +118,25 @@ def _bounds_periodic(
 
 _FIELD = Metric("peak_field_v_per_m", "V/m", "largest field")
 _HELD = (
-    Metric("error", "", "largest error of a mean of 1 s, from 10 s on, in strain",
+    Metric("error", "", "largest error of a mean over 1 s, from 10 s on (strain)",
            "noise alone: the mean of all measurements before, one constant unknown"),
     _FIELD,
 )  # fmt: skip
 _CHARGED = (
-    Metric("error", "", "largest error of a mean of 1 s while it is held, from 10 s on, in strain"),
-    Metric("noise_at_rest", "", "standard deviation of its second half, in strain"),
-    Metric("error_after_return", "", "mean error from 0.5 to 1.5 s after the way back, in strain"),
+    Metric("error", "", "largest error of a mean over 1 s at 6 % strain, from 10 s on (strain)"),
+    Metric("noise_at_rest", "", "standard deviation in the second half of the hold (strain)"),
+    Metric("error_after_return", "", "mean error from 0.5 to 1.5 s after the way back (strain)"),
     _FIELD,
 )
 _REPEATED = (
-    Metric("error_first", "", "rms error over peak-to-peak, first period", TRACKING_LIMIT),
-    Metric("error_after_ten", "", "the same after ten periods", TRACKING_LIMIT),
-    Metric("left", "", "the second over the first"),
+    Metric("error_first", "", "rms error over peak-to-peak in the first period", TRACKING_LIMIT),
+    Metric("error_after_ten", "", "rms error over peak-to-peak after ten periods", TRACKING_LIMIT),
+    Metric("left", "", "error after ten periods over that in the first period"),
     _FIELD,
 )
 
 LASTING_TASKS = (
-    Task("T6", "hold for 10 min after a step of 0.10", "hz", _HELD, _hold("hz"), _score_hold,
+    Task("T6", "hold for 10 min after a step of 10 % strain", "hz", _HELD, _hold("hz"), _score_hold,
          _bounds_hold, classes=("host-100hz",)),
     Task("T6-retention", "the same with a fifth of the voltage acting late", "hz", _HELD,
          _hold("retention"), _score_hold, _bounds_hold, classes=("host-100hz",)),

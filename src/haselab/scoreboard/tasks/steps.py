@@ -31,19 +31,22 @@ _SLOW_S = 6.0
 _FASTEST = (
     "time-optimal from rest to rest on the true law: full voltage, then 0 V. No dead time, no noise"
 )
-RISE = Metric("rise_s", "s", "rise 10 to 90 % of the step, step of 0.04 at strain 0", _FASTEST)
-OVERSHOOT = Metric("overshoot", "", "overshoot beyond the desired strain, of that step")
-SETTLING = Metric(
-    "settling_s", "s", "time until within 2 % of that step of the desired strain", _FASTEST
+RISE = Metric("rise_s", "s", "rise time (10 to 90 %) of a step of 4 % strain at strain 0", _FASTEST)
+OVERSHOOT = Metric(
+    "overshoot", "", "overshoot of this step beyond the desired strain, over the step"
 )
+SETTLING = Metric(
+    "settling_s", "s",
+    "time after which this step stays within 2 % of the step around the desired strain", _FASTEST,
+)  # fmt: skip
 _ALL = (
     RISE,
     OVERSHOOT,
     SETTLING,
-    Metric("rise_from_zero_s", "s", "rise of a step of 0.14 from 0 V", _FASTEST),
-    Metric("worst_overshoot", "", "largest overshoot of all steps"),
-    Metric("iae", "s", "integral of the error over the step, mean of all steps"),
-    Metric("drive_variation_v_per_s", "V/s", "changes of the drive"),
+    Metric("rise_from_zero_s", "s", "rise time of a step of 14 % strain from 0 V", _FASTEST),
+    Metric("worst_overshoot", "", "largest overshoot of all steps, over the step"),
+    Metric("iae", "s", "integral of the absolute error over the step, mean of all steps"),
+    Metric("drive_variation_v_per_s", "V/s", "sum of the changes of the drive, per second"),
     Metric("peak_field_v_per_m", "V/m", "largest field"),
 )
 
@@ -165,7 +168,7 @@ def _bounds_other(known: KnownActuator, scenario: Scenario, loop: LoopClass) -> 
 
 def _task(name: str, title: str, device: str, played: str, hold_s: float) -> Task:
     metrics = (
-        Metric("rise_s", "s", "rise 10 to 90 %, step of 12 % of the range", _FASTEST),
+        Metric("rise_s", "s", "rise time (10 to 90 %) of a step of 12 % of the range", _FASTEST),
         OVERSHOOT,
         SETTLING,
         Metric("peak_field_v_per_m", "V/m", "largest field"),

@@ -152,13 +152,14 @@ def _bounds_tracking(
 
 TRACKING_TASKS = (
     Task(
-        "T2", "staircase from -0.03 to 0.21", "hz",
+        "T2", "staircase from -3 to 21 % strain", "hz",
         (
-            Metric("error_at_rest", "", "largest error at the end of a stair, in strain",
+            Metric("error_at_rest", "", "largest error of the mean at the end of a stair (strain)",
                    "noise alone: the mean of all measurements of a stair, one constant unknown; "
                    "the median of the largest of all stairs"),
-            Metric("noise_at_rest", "", "standard deviation there, in strain"),
-            Metric("overshoot", "", "largest overshoot, of the stair"),
+            Metric("noise_at_rest", "",
+                   "standard deviation at the end of a stair, median of all (strain)"),
+            Metric("overshoot", "", "largest overshoot of all stairs, over the stair"),
             Metric("peak_field_v_per_m", "V/m", "largest field"),
         ),
         _staircase, _score_staircase, _bounds_staircase,
@@ -167,7 +168,8 @@ TRACKING_TASKS = (
         "T3", "sines of 0.1 to 10 Hz, gait at 1 and 2 Hz", "hz",
         (
             *(
-                Metric(name, "", f"rms error over peak-to-peak, {frequency_hz:g} Hz",
+                Metric(name, "", f"rms error over peak-to-peak, {name.partition('_')[0]} of "
+                       f"{frequency_hz:g} Hz",
                        TRACKING_LIMIT if frequency_hz >= 1.0 else "")
                 for name, _, _, frequency_hz, _ in _parts()
             ),

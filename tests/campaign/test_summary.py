@@ -68,6 +68,21 @@ def test_sobol_indices_are_those_of_a_known_function(campaigns: Any) -> None:
             assert found[path][index]["value"] == pytest.approx(share, abs=0.03)
 
 
+def test_sobol_indices_come_with_the_sign_of_the_dependence(campaigns: Any) -> None:
+    """From the independent points: 128 in 64 blocks."""
+    plan = campaigns.plan(DESIGN.format("saltelli", 64))
+    rows = campaigns.rows_of(plan, lambda gain, omega: 3.0 * gain - omega)
+    summary = summarised(plan, rows)
+    found = {one["parameter"]: one for one in summary["sensitivities"]}
+    gain, omega = (found[f"case.{key}"] for key in ("gain", "natural_frequency_rad_s"))
+    assert gain["correlation"]["value"] > 0.9 and gain["count"] == 128
+    assert -0.6 < omega["correlation"]["value"] < -0.1 and omega["correlation"]["ci95"] is None
+    assert "(total Sobol index 0.9" in (line := most_important(summary, rows))
+    assert "; rank correlation -0." in line
+    page = campaign_page(summary, {})
+    assert "Sensitivity: Sobol indices" in page and "Sensitivity: rank correlation" in page
+
+
 def test_a_failed_case_takes_its_block_out_of_the_indices(campaigns: Any) -> None:
     plan = campaigns.plan(DESIGN.format("saltelli", 16))
     rows = campaigns.rows_of(plan, lambda gain, omega: 3.0 * gain + omega)
@@ -179,7 +194,8 @@ def test_one_line_names_the_most_important_parameters_of_the_first_result(campai
     line = most_important(summarised(plan, rows), rows)
     assert re.fullmatch(
         r"y depends most on case\.natural_frequency_rad_s \(total Sobol index 0\.9\d?, 0\.\d+ to "
-        r"[01]\.?\d*\), case\.gain \(total Sobol index 0\.\d+, 0\.\d+ to 0\.\d+\)",
+        r"[01]\.?\d*; rank correlation 0\.\d+\), case\.gain \(total Sobol index 0\.\d+, 0\.\d+ to "
+        r"0\.\d+; rank correlation 0\.\d+\)",
         line,
     ), line
     plan = campaigns.plan(DESIGN.format("random", 40))

@@ -34,7 +34,7 @@ def sensitivities(
         names: of the results.
         independent: the cases of a group are independent draws.
     Yields:
-        Sobol indices of a design `saltelli`, else rank correlations.
+        Rank correlations; for a design `saltelli` with the Sobol indices, which have no sign.
     """
     unranked = unranked_of(campaign)
     paths = [one.path for one in campaign.distributions if one.path not in unranked]
@@ -42,6 +42,10 @@ def sensitivities(
         for group in groups:
             if campaign.design.kind == "saltelli":
                 found = _sobol_indices(group, name, paths) if _is_whole(campaign, groups) else []
+                drawn = _without_mixed(group, len(paths))
+                signed = _rank_correlations(drawn, name, paths, independent=False)
+                ranks = {one["parameter"]: one for one in signed}
+                found = [{**ranks.get(one["parameter"], {}), **one} for one in found]
             else:
                 found = _rank_correlations(group, name, paths, independent=independent)
             for one in found:
@@ -63,6 +67,13 @@ def unranked_of(campaign: Campaign) -> list[str]:
 def _is_whole(campaign: Campaign, groups: Sequence[Group]) -> bool:
     """Whether each group is one sample of the design, which indices need."""
     return all(len(group.rows) == campaign.points for group in groups)
+
+
+def _without_mixed(group: Group, count: int) -> Group:
+    """The first and the last case of each block; the others mix the parameters of both."""
+    size = count + 2
+    rows = tuple(row for k, row in enumerate(group.rows) if k % size in (0, size - 1))
+    return Group(group.label, rows)
 
 
 def _sobol_indices(group: Group, name: str, paths: Sequence[str]) -> list[JsonObject]:

@@ -132,7 +132,9 @@ def most_important(summary: Mapping[str, Any], rows: Sequence[CaseRow]) -> str:
                 unclear = True
                 continue
             near = "" if ends is None else f", {ends[0]:.2g} to {ends[1]:.2g}"
-            text = f"{one['parameter']} ({kind} {number['value']:.2g}{near})"
+            signed = is_sobol and "correlation" in one
+            sign = f"; rank correlation {one['correlation']['value']:.2g}" if signed else ""
+            text = f"{one['parameter']} ({kind} {number['value']:.2g}{near}{sign})"
             listed.append((-abs(number["value"]), text))
     if not listed:
         return f"{name}{place}: each {kind} has an interval that contains 0" if unclear else ""

@@ -210,3 +210,30 @@ def test_new_guardians_watch_after_the_first_ones_have_acted(tmp_path: Path) -> 
             with contextlib.suppress(ProcessLookupError):
                 os.kill(bench, signal.SIGCONT)
             ended(panel)
+
+
+def test_a_bench_that_no_longer_responds_is_not_called_safe(tmp_path: Path) -> None:
+    """The board and the instruments have lost their connections while the drive is at 5 kV."""
+    rig = tmp_path / "served.toml"
+    with contextlib.ExitStack() as connected_bench:
+        served = connected_bench.enter_context(ServedTwin(twin_of_reading("hz"), 1, PACE))
+        rig.write_text(served.rig_file(ahead_blocks=5) + PATIENT)
+        panel = started("--rig", str(rig))
+
+        async def play() -> None:
+            async with connected(panel) as page:
+                assert "answer" in await page.arm(1.5)
+                await page.ask("drive", value_v=1.0)
+                await page.until(lambda state: state["drive_v"] == 1.0)
+                rig.unlink()  # so that `haselab rig safe` cannot help
+                connected_bench.close()
+                await page.until(lambda state: state["stage"] != "running")
+                await page.until(lambda state: "by hand" in state["reason"])
+                found = await asyncio.to_thread(panel.stop)
+                assert found["commanded"] is False and found["fault"]
+                await page.until(lambda state: "by hand" in state["reason"])
+
+        try:
+            asyncio.run(play())
+        finally:
+            ended(panel)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import signal
 import socket
 import subprocess
@@ -16,7 +17,7 @@ import pytest
 
 from haselab.base import DeviceError
 from haselab.cli.bench import panel as command
-from haselab.panel import bench_process, processes
+from haselab.panel import bench_process, processes, stop_process
 from haselab.panel.files import PanelFiles
 from haselab.panel.processes import stop_answers
 from haselab.panel.stop_process import StopServer
@@ -73,10 +74,11 @@ def test_stop_that_works_answers() -> None:
 def test_a_fault_while_stopping_keeps_no_later_stop_from_working(tmp_path: Path) -> None:
     stopped: list[str] = []
 
-    def stop(reason: str) -> None:
+    def stop(reason: str) -> str:
         stopped.append(reason)
         if len(stopped) == 1:
             raise RuntimeError("a driver that haselab does not know")
+        return ""
 
     bench: Any = SimpleNamespace(stop=stop)
     job = threading.Thread(target=bench_process._stops, args=(tmp_path, bench), daemon=True)
@@ -124,3 +126,17 @@ def test_a_stop_process_that_hangs_is_killed() -> None:
     processes._end(process, 0.1)
     processes._end(process, 0.1)
     assert process.returncode == -signal.SIGKILL
+
+
+@pytest.mark.parametrize("fault", ["", "a driver failed during shutdown: no link"])
+def test_stop_says_whether_0_v_was_commanded(fault: str, tmp_path: Path) -> None:
+    bench: Any = SimpleNamespace(stop=lambda reason: fault)
+    job = threading.Thread(target=bench_process._stops, args=(tmp_path, bench), daemon=True)
+    job.start()
+    while not (tmp_path / "stop.sock").exists():
+        time.sleep(0.01)
+    stop = stop_process._Stop(tmp_path, f"test-stop-{tmp_path.name}", "")
+    with contextlib.closing(stop._interlock) as interlock:
+        found = stop()
+        assert interlock.reason.startswith("STOP was pressed")
+    assert (found["commanded"], found["fault"]) == (not fault, fault)

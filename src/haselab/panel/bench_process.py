@@ -8,7 +8,8 @@ recordings are new folders in RUNS. FOLDER is private to one panel and holds
 - `bench.sock`: commands of the web server, one JSON object per line, each with an `id` and `at_s`,
   the time of the last data that its page received. The state of the bench is sent 20 times a
   second, with the time `clock_s`;
-- `stop.sock`: each datagram stops the bench; it is answered once the output was commanded to 0 V.
+- `stop.sock`: each datagram stops the bench; the answer is that the output was commanded to 0 V, or
+  why this is not certain.
 
 It prints `ready KEY`, where KEY names the interlock of the bench, and ends when its stdin or its
 parent ends.
@@ -39,6 +40,7 @@ from haselab.panel.columns import LiveWriter
 from haselab.panel.files import PanelFiles
 from haselab.panel.live_bench import CARRIER_HZ, LiveBench
 from haselab.panel.pages.study_job import StudyJob
+from haselab.panel.stop_process import COMMANDED
 from haselab.panel.study_player import StudyPlayer
 from haselab.pipelines.actuator_bench import prepare_bench
 from haselab.pipelines.design.model_file import read_tables
@@ -60,6 +62,7 @@ __all__ = ["main"]
 _STATES_HZ = 20.0
 _BEHIND_S = 0.2  # a simulated bench that is further behind real time does not catch up
 _MOST_BYTES = 65536  # of one command
+_MOST_ANSWERED = 400  # bytes of an answer to STOP
 _PARENT_S = 0.2  # between two checks of the parent
 
 
@@ -133,18 +136,18 @@ class _Link:
 
 
 def _stops(folder: Path, bench: LiveBench) -> None:
-    """Stop the bench for each datagram, and answer when 0 V was commanded."""
+    """Stop the bench for each datagram, and answer when 0 V was commanded, or that it was not."""
     with socket.socket(socket.AF_UNIX, socket.SOCK_DGRAM) as box:
         box.bind(str(folder / "stop.sock"))
         while True:
             data, sender = box.recvfrom(512)
             try:
-                bench.stop(data.decode(errors="replace"))
+                fault = bench.stop(data.decode(errors="replace"))
             except BaseException:  # without an answer, the guardians act; the next STOP must work
                 traceback.print_exc()
                 continue
             with contextlib.suppress(OSError):
-                box.sendto(b"0 V commanded", sender)
+                box.sendto(fault.encode()[:_MOST_ANSWERED] or COMMANDED, sender)
 
 
 @contextlib.contextmanager
@@ -220,7 +223,8 @@ def main(words: list[str]) -> int:
         words: rig file, folder, folder of recordings, lease in s, and optionally the actuator
             file.
     Returns:
-        0, or 1 if the bench cannot be used; the reason is printed after `failed`.
+        0, or 1 if the bench cannot be used; the reason is printed after `failed`, or after
+        `refused` if a file is the reason.
     """
     path, folder, runs, lease_s = *(Path(word) for word in words[:3]), float(words[3])
     actuator = Path(words[4]) if len(words) > 4 else None
@@ -277,7 +281,8 @@ def main(words: list[str]) -> int:
                 finally:
                     bench.close()
     except HaselabError as error:
-        print(f"failed {' '.join(str(error).split())}", flush=True)
+        verb = "refused" if isinstance(error, InputError) else "failed"
+        print(f"{verb} {' '.join(str(error).split())}", flush=True)
         return 1
     return 0
 

@@ -109,6 +109,7 @@ class LiveBench:
         self._prepare, self._player = prepare, player or StudyPlayer()
         self._player.note = self._note
         self._study = ArmedStudy(rig, self._leases, self._player)
+        self._danger = ""  # why 0 V was not confirmed at the end of the last run
         self._reopen_s = 0.0  # time of the next attempt to open the board again
         self._over = False  # the panel has ended: commands are refused
         self._events: deque[tuple[float, str]] = deque(maxlen=_MOST_EVENTS)
@@ -132,7 +133,7 @@ class LiveBench:
             limits = (self._loop.saturation.low, self._loop.saturation.high)
         return BenchState(
             stage.value, self._mode, drive_v, target_v, self._reference,
-            self._limit_v, self._holder, latched or self._reason, low, high,
+            self._limit_v, self._holder, self._danger or latched or self._reason, low, high,
             about.amplifier_gain, limits, about.name, self._rig.simulated, self._player.task,
             self._player.done, self._player.prompt, self._player.step, tuple(self._events),
             self._study.recorded, "" if job is None else job.options.folder.name,
@@ -196,14 +197,17 @@ class LiveBench:
                 self._leases.require_recent(at_s)
             return commands[what](holder, values)
 
-    def stop(self, reason: str) -> None:
+    def stop(self, reason: str) -> str:
         """Take the bench to 0 V at once and latch the reason. Never waits for a command.
 
         Args:
             reason: one sentence.
+        Returns:
+            Why 0 V is not certain; empty if it was commanded, here or by a guardian.
         """
         self._rig.safety.trip(reason)
         self._note("STOP")
+        return self._rig.unconfirmed()
 
     def end_study(self, reason: str) -> None:
         """End a study that is being played; the bench goes to 0 V and the recording is kept.
@@ -296,7 +300,7 @@ class LiveBench:
         self._request = None
         self._rig.safety.arm(request, str(values.get("acknowledged", "")))
         self._note("armed")
-        self._reason = ""
+        self._reason = self._danger = ""
         self._leases.begin(holder)
         if job is not None:  # `step` plays it
             self._rig.limit_drive(limit_v, _TYPED)
@@ -430,8 +434,8 @@ class LiveBench:
         self._note(reason or "0 V")
         try:
             self._rig.safe()
-        except SafetyError as error:  # the latch keeps it
-            self._reason = str(error)
+        except SafetyError as error:
+            self._danger = str(error)  # the latch keeps the first reason, which may be another one
         finally:
             self._rig.limit_drive()
             self._rig.safety.end_run()

@@ -16,7 +16,7 @@ from typing import NamedTuple
 
 import uvicorn
 
-from haselab.base import DeviceError
+from haselab.base import DeviceError, InputError
 from haselab.panel.files import PanelFiles
 from haselab.panel.page_server import Access, WebServer, listening, served_ips
 from haselab.panel.web import WebSettings, application
@@ -74,6 +74,7 @@ def _started(words: list[str], what: str) -> tuple[subprocess.Popen[str], str]:
 
     Raises:
         DeviceError: It did not start.
+        InputError: A file keeps it from starting.
     """
     command = [sys.executable, "-m", *words]
     process = subprocess.Popen(
@@ -87,6 +88,8 @@ def _started(words: list[str], what: str) -> tuple[subprocess.Popen[str], str]:
     word, _, rest = line.partition(" ")
     if word != "ready":
         _end(process)
+        if word == "refused":
+            raise InputError(rest)
         raise DeviceError(
             rest
             or f"The {what} ended, or was not ready within {_START_S:g} s. Its messages are above."
@@ -122,8 +125,9 @@ def running_panel(
         The panel; the caller runs its server.
     Raises:
         DeviceError: A process does not start, or the port is in use.
-        InputError: This computer does not have the address.
+        InputError: A file is wrong, or this computer does not have the address.
     """
+    is_real = isinstance(load_rig(files.rig), BenchConfig)
     in_memory = Path("/dev/shm")
     place = in_memory if in_memory.is_dir() and os.access(in_memory, os.W_OK) else None
     with contextlib.ExitStack() as opened:
@@ -137,7 +141,7 @@ def running_panel(
         bench, key = _started(["haselab.panel.bench_process", *words], "bench process")
         opened.callback(_end, bench)
         settings = WebSettings(folder, access, 0, files)
-        real = [str(files.rig)] if isinstance(load_rig(files.rig), BenchConfig) else []
+        real = [str(files.rig)] if is_real else []
         words = [",".join(served_ips(lan)), str(folder), key, ",".join(access.origins), *real]
         stop, stop_port = _started(["haselab.panel.stop_process", *words], "stop process")
         opened.callback(_end, stop, _END_STOP_S)

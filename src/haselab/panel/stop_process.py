@@ -28,8 +28,9 @@ from typing import Any
 
 from haselab.safety.interlock import Interlock
 
-__all__ = ["StopServer", "main"]
+__all__ = ["COMMANDED", "StopServer", "main"]
 
+COMMANDED = b"0 V commanded"  # answer of the bench process; any other one is a fault
 _REASON = "STOP was pressed on the panel"
 _NICENESS = -10
 _ANSWER_S = 2.0  # longest wait for the bench process
@@ -155,25 +156,27 @@ class _Stop:
         revoked_s = time.perf_counter() - begun_s
         if self._rig:
             threading.Thread(target=self._rig_safe, daemon=True).start()
-        confirmed = self._tell_bench(_PROMPT_S)
-        if not confirmed:
+        answer = self._tell_bench(_PROMPT_S)
+        if answer != COMMANDED:
             self._interlock.lease(0.0)  # a guardian looks every 20 ms
-            confirmed = self._tell_bench(_ANSWER_S - _PROMPT_S)
-        return {"revoked_ms": 1e3 * revoked_s, "commanded": confirmed,
+        if not answer:
+            answer = self._tell_bench(_ANSWER_S - _PROMPT_S)
+        return {"revoked_ms": 1e3 * revoked_s, "commanded": answer == COMMANDED,
+                "fault": "" if answer == COMMANDED else answer.decode(errors="replace"),
                 "commanded_ms": 1e3 * (time.perf_counter() - begun_s)}  # fmt: skip
 
-    def _tell_bench(self, wait_s: float) -> bool:
-        """Send the bench process to 0 V; whether it answered in time."""
+    def _tell_bench(self, wait_s: float) -> bytes:
+        """Send the bench process to 0 V; its answer, empty if there was none in time."""
         own = self._folder / f"stop-{os.getpid()}-{threading.get_ident()}"
         with contextlib.suppress(OSError), socket.socket(socket.AF_UNIX, socket.SOCK_DGRAM) as box:
             try:
                 box.bind(str(own))
                 box.settimeout(wait_s)
                 box.sendto(_REASON.encode(), str(self._folder / "stop.sock"))
-                return bool(box.recv(64))
+                return box.recv(512)
             finally:
                 own.unlink(missing_ok=True)
-        return False
+        return b""
 
     def _rig_safe(self) -> None:
         """Start `haselab rig safe`, unless it is running."""

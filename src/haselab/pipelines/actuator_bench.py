@@ -15,6 +15,8 @@ from haselab.runtime.lockin import lockin_of
 
 __all__ = ["prepare_bench", "refuse_other_kind"]
 
+_SAME_GAIN = 0.05  # relative difference of a nominal and a measured gain
+
 
 def refuse_other_kind(tables: ActuatorTables, path: Path, twin: TwinConfig) -> None:
     """Refuse to play the maps and the controller of one kind of actuator on a twin of another.
@@ -56,11 +58,13 @@ def prepare_bench(
     Returns:
         Why the calibration was left out; empty if it is used or there is none.
     Raises:
-        InputError: no voltage is within both limits, the calibration is for another carrier,
-            sampling rate or amplifier, or the twin is of another kind.
+        InputError: the gain of the amplifier is another one, no voltage is within both limits, the
+            calibration is for another carrier, sampling rate or amplifier, or the twin is of
+            another kind.
     """
     if twin is not None:
         refuse_other_kind(tables, path, twin)
+    _refuse_other_gain(rig, tables, path)
     _limit(rig, tables, path)
     if not tables.sensing.is_calibrated:
         return ""
@@ -72,6 +76,18 @@ def prepare_bench(
     calibration = MonitorCalibration(scale_s, stray_s, found.offsets_v)
     rig.description = replace(about, calibration=calibration)
     return ""
+
+
+def _refuse_other_gain(rig: Rig, tables: ActuatorTables, path: Path) -> None:
+    """Refuse an actuator file whose voltages become others at the actuator of this rig."""
+    stated, actual = tables.drive.gain_v_per_v, rig.description.amplifier_gain
+    if stated is None or abs(actual / stated - 1.0) <= _SAME_GAIN:
+        return
+    raise InputError(
+        f"gain_v_per_v = {stated:g} in [drive], but the amplifier of the rig has a gain of "
+        f"{actual:g}: the voltages in the actuator file would be {actual / stated:.3g} times as "
+        f"high at the actuator. Correct the gain in one of the files. {path}"
+    )
 
 
 def _limit(rig: Rig, tables: ActuatorTables, path: Path) -> None:

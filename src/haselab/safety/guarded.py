@@ -186,6 +186,16 @@ class GuardedRig(Rig):
         """Take the bench to 0 V without reading it back: the first half of `safe`."""
         Shutdown(self).run()
 
+    def unconfirmed(self) -> str:
+        """Why the last shutdown is not known to have reached 0 V; empty if it did, or a guardian.
+
+        Waits until the guardians that were called have answered.
+        """
+        if not (fault := self.bench.unconfirmed):
+            return ""
+        guardians = self.safety.guardians
+        return fault if guardians is None or guardians.outcome() else ""
+
     def confirm_zero(self) -> None:
         """Read back, unless this was done since anything was last energised.
 

@@ -63,6 +63,7 @@ class GuardedBench:
         self.unbroken = False  # whether the next block has to follow without a gap
         self.found: dict[str, OutputState] = {}  # by instrument, since anything was energised
         self.asked_guardian = False  # since anything was energised
+        self.unconfirmed = ""  # why 0 V is not certain, since anything was energised
         self._requests = -1  # number that the gate had let through then
         self.turn = threading.Lock()  # several threads report instruments
         self.on_block: Callable[[NDArray[np.int16]], None] = lambda codes: None  # of each block
@@ -72,7 +73,7 @@ class GuardedBench:
         requests = self.safety.gate.requests
         if requests != self._requests:
             self._requests = requests
-            self.found, self.asked_guardian = {}, False
+            self.found, self.asked_guardian, self.unconfirmed = {}, False, ""
 
     @property
     def left_out(self) -> int:

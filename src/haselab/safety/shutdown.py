@@ -152,6 +152,7 @@ class Shutdown:
 
     def _ask_guardian(self, reason: str) -> None:
         with self._bench.turn:
+            self._bench.unconfirmed = self._bench.unconfirmed or reason
             if self._safety.guardians is None or self._bench.asked_guardian:
                 return
             self._bench.asked_guardian = True

@@ -516,5 +516,5 @@ def _state_of(key: str) -> dict[str, object]:
     else:
         state = "not armed"
     if reason:
-        state += f"; made safe: {reason}. Acknowledge this reason to arm the bench again"
+        state += f"; tripped: {reason}. Acknowledge this reason to arm the bench again"
     return {"bench": key, "armed": live, "process": pid or None, "reason": reason, "state": state}

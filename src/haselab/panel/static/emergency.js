@@ -33,7 +33,8 @@
     try {
       const answer = await fetch(`${address}/stop`, { method: "POST", keepalive: true, signal: AbortSignal.timeout(ANSWER_MS) });
       const found = await answer.json();
-      show(found.commanded ? `STOP: 0 V commanded at ${new Date().toTimeString().slice(0, 8)}` : "THE BENCH PROCESS DOES NOT ANSWER. Press the emergency stop of the bench.", !found.commanded);
+      const unsafe = found.fault ? `0 V IS NOT CONFIRMED (${found.fault}).` : "THE BENCH PROCESS DOES NOT ANSWER.";
+      show(found.commanded ? `STOP: 0 V commanded at ${new Date().toTimeString().slice(0, 8)}` : `${unsafe} Press the emergency stop of the bench.`, !found.commanded);
     } catch {
       show("STOP DOES NOT ANSWER. Press the emergency stop of the bench.", true);
     }

@@ -7,6 +7,7 @@ import os
 import select
 import subprocess
 import sys
+import threading
 import time
 from collections.abc import Callable, Sequence
 from pathlib import Path
@@ -43,18 +44,20 @@ class _Process:
         self.result = ""  # what it did, once it has acted
         self.fault = ""
         self.acting = False
+        self.first: str | None = None  # line of output, whether it watches the bench
         self.pid = 0  # known once it is ready
         self._program = os.getpid()
         self._heard = b""
+        self._reading = threading.Lock()  # STOP may wait for the result while this one starts
         self._heartbeat = Heartbeat()
         self.process = subprocess.Popen(
             command, stdin=subprocess.PIPE, stdout=subprocess.PIPE, stderr=subprocess.DEVNULL,
             start_new_session=True,
         )  # fmt: skip
 
-    def is_ready(self, word: str, key: str) -> bool:
+    def is_ready(self, key: str) -> bool:
         """Whether its first line confirms that it watches this bench."""
-        verb, _, rest = word.partition(" ")
+        verb, _, rest = (self.first or "").partition(" ")
         pid, _, named = rest.partition(" ")
         self.pid = int(pid) if pid.isdecimal() else 0
         return (verb, named) == ("ready", key)
@@ -73,10 +76,10 @@ class _Process:
         with contextlib.suppress(OSError):
             os.write(self.process.stdin.fileno(), line.encode() + b"\n")
 
-    def next_line(self, wait_s: float) -> str | None:
-        """Return its next line of output, or None if none comes in time."""
+    def _next_line(self) -> str | None:
+        """Return its next line of output, or None if there is none yet."""
         if b"\n" not in self._heard:
-            ready, _, _ = select.select([self.out], [], [], max(0.0, wait_s))
+            ready, _, _ = select.select([self.out], [], [], 0.0)
             self._heard += os.read(self.out, 4096) if ready else b""
         if b"\n" not in self._heard:
             return None
@@ -85,14 +88,18 @@ class _Process:
 
     def receive(self) -> None:
         """Read its output so far."""
-        while (word := self.next_line(0.0)) is not None:
-            verb, _, rest = word.partition(" ")
-            self.acting = True
-            if verb == "acted":
-                self.result = f"{self.name} made the bench safe: {rest}."
-            elif verb == "tried":
-                self.result = f"{self.name} could not make the bench safe ({rest})."
-                self.fault = rest
+        with self._reading:
+            while (word := self._next_line()) is not None:
+                if self.first is None:
+                    self.first = word
+                    continue
+                verb, _, rest = word.partition(" ")
+                self.acting = True
+                if verb == "acted":
+                    self.result = f"{self.name} made the bench safe: {rest}."
+                elif verb == "tried":
+                    self.result = f"{self.name} could not make the bench safe ({rest})."
+                    self.fault = rest
 
     def lost(self, beats: int, now_s: float) -> str:
         """Why it no longer watches the bench; empty while it does."""
@@ -172,12 +179,15 @@ class Guardians:
         ]
         end_s = self._clock() + _START_S
         for each in self._processes:
-            while (word := each.next_line(end_s - self._clock())) is None:
-                if self._clock() >= end_s or each.process.poll() is not None:
+            while each.first is None and self._clock() < end_s:
+                ended = each.process.poll() is not None
+                select.select([each.out], [], [], _EVERY_S)
+                each.receive()
+                if ended:
                     break
-            if word is None or not each.is_ready(word, self._interlock.key):
+            if not each.is_ready(self._interlock.key):
                 self.close()
-                why = (word or "it did not respond").removeprefix("failed ")
+                why = (each.first or "it did not respond").removeprefix("failed ")
                 raise DeviceError(
                     f"{each.name} did not start: {why}. Nothing was energised. Run 'haselab rig "
                     "check' on this rig file."

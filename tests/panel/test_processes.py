@@ -17,6 +17,7 @@ import pytest
 
 from haselab.base import DeviceError
 from haselab.cli.bench import panel as command
+from haselab.cli.main import main
 from haselab.panel import bench_process, processes, stop_process
 from haselab.panel.files import PanelFiles
 from haselab.panel.processes import stop_answers
@@ -140,3 +141,27 @@ def test_stop_says_whether_0_v_was_commanded(fault: str, tmp_path: Path) -> None
         found = stop()
         assert interlock.reason.startswith("STOP was pressed")
     assert (found["commanded"], found["fault"]) == (not fault, fault)
+
+
+@pytest.mark.parametrize(
+    ("text", "said"),
+    [("kind = 'bench", "TOML"), ("kind = 'toaster'\n", "toaster"), (None, "r.toml")],
+)
+def test_a_wrong_rig_file_is_bad_input(
+    text: str | None, said: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    if text is not None:
+        (tmp_path / "r.toml").write_text(text)
+    with pytest.raises(SystemExit) as raised:
+        main(["panel", "--no-browser", "--rig", str(tmp_path / "r.toml")])
+    found = capsys.readouterr().err
+    assert raised.value.code == 2 and found.count("\n") == 1 and said in found
+
+
+def test_what_only_the_bench_process_finds_wrong_is_bad_input(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    (tmp_path / "r.toml").write_text("kind = 'twin'\ntwin = 'none.toml'\n")
+    with pytest.raises(SystemExit) as raised:
+        main(["panel", "--no-browser", "--rig", str(tmp_path / "r.toml")])
+    assert raised.value.code == 2 and "none.toml" in capsys.readouterr().err

@@ -88,6 +88,7 @@ def _started(words: list[str], what: str) -> tuple[subprocess.Popen[str], str]:
     word, _, rest = line.partition(" ")
     if word != "ready":
         _end(process)
+        process.stdout.close()
         if word == "refused":
             raise InputError(rest)
         raise DeviceError(

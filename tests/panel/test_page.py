@@ -28,6 +28,7 @@ frame_rate_hz = 200.0
 """
 
 STATIC = Path(__file__).parents[2] / "src" / "haselab" / "panel" / "static"
+RIGS = Path(__file__).parents[2] / "rigs"
 WAIT_MS = 1e3 * WAIT_S
 PAGES = {  # a text of each, once it is there
     "Studies": "Keep no camera frames", "Doctor": "checks", "Design": "without an actuator file",
@@ -146,6 +147,26 @@ def test_recordings_have_the_local_time_of_their_folders(browser: Browser, tmp_p
             page.goto(found.address)
             page.get_by_role("button", name="Studies").click(timeout=WAIT_MS)
             expect(page.get_by_text("2026-02-01 05:30:00")).to_be_visible(timeout=WAIT_MS)
+    finally:
+        ended(found)
+
+
+def test_a_bipolar_bench_shows_limits_of_both_signs(browser: Browser, tmp_path: Path) -> None:
+    text = (RIGS / "twin-hz.toml").read_text()
+    (tmp_path / "rig.toml").write_text(text.replace("drive_low_v = 0.0", "drive_low_v = -2.0"))
+    found = started("--rig", str(tmp_path / "rig.toml"))
+    try:
+        with browser.new_context() as context:
+            page = context.new_page()
+            page.set_default_timeout(WAIT_MS)
+            page.goto(found.address)
+            page.get_by_role("button", name="Arm the bench").click()
+            expect(page.get_by_text("at most ±2.000 V (±10.00 kV)")).to_be_visible(timeout=WAIT_MS)
+            page.get_by_label("Highest drive of this run").fill("0.2")
+            page.keyboard.press("Enter")
+            expect(page.get_by_text("up to ±0.200 V (±1.00 kV)")).to_be_visible(timeout=WAIT_MS)
+            expect(page.get_by_text("The sensing signal is on")).to_be_visible()
+            expect(page.get_by_text("haselab example actuator")).to_be_visible()
     finally:
         ended(found)
 

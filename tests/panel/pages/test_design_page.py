@@ -58,7 +58,7 @@ def slider(page: Page, name: str) -> Page:
 
 
 def typed(page: Page, name: str) -> Page:
-    return page.get_by_role("spinbutton", name=name)
+    return page.get_by_role("textbox", name=name)
 
 
 def shown_gains(page: Page) -> dict[str, float]:
@@ -121,7 +121,7 @@ def test_gains_are_changed_and_written_by_keyboard_alone(page: Page, path: Path)
     page.keyboard.press("ArrowRight")
     # One of 400 steps over four decades, on the grid of the slider.
     assert before < shown_gains(page)["kp"] < before * 10 ** (2 * 4 / 400)
-    tab_to(page, "ki", "spinbutton")
+    tab_to(page, "ki", "textbox")
     page.keyboard.press("Control+a")
     page.keyboard.type("6.25")
     page.keyboard.press("Enter")

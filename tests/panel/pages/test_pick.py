@@ -52,10 +52,8 @@ def centre_std_px(
     return float(slope_std / (depth / (2 * sigma**2)))
 
 
-@pytest.fixture(scope="module")
-def video(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """A clip of the twin's camera, in a folder of its own below a folder of recordings."""
-    path = tmp_path_factory.mktemp("runs") / "run 1" / "clip.mkv"
+def clip(path: Path) -> Path:
+    """Write a clip of the twin's camera."""
     strain = np.concatenate([np.zeros(REST), np.linspace(0.0, 0.05, FRAMES - REST)])
     lengths_m = np.repeat(LENGTH_M * (1 + strain)[:, None], CAMERA.exposure_samples, axis=1)
     frames = TwinCamera(CAMERA, 0.06, 0.05, seed=4).render(lengths_m, first_index=0)
@@ -63,6 +61,12 @@ def video(tmp_path_factory: pytest.TempPathFactory) -> Path:
     writer.append(frames, np.arange(FRAMES) / 400.0)
     writer.close()
     return path
+
+
+@pytest.fixture(scope="module")
+def video(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A clip in a folder of its own below a folder of recordings."""
+    return clip(tmp_path_factory.mktemp("runs") / "run 1" / "clip.mkv")
 
 
 @dataclass

@@ -1,12 +1,20 @@
 // Arming, and the progress of a study: for the live page and the page of the studies.
 import { html, useState, useEffect, useRef } from "/static/vendor/htm-preact.js";
+import { useNumber } from "/static/number.js";
 
-export const kilo = (v, gain) => `${v.toFixed(3)} V (${(v * gain / 1000).toFixed(2)} kV)`;
+export const fixed = (v, count) => (Number(v.toFixed(count)) + 0).toFixed(count); // never -0.0
+export const kilo = (v, gain) => `${fixed(v, 3)} V (${fixed(v * gain / 1000, 2)} kV)`;
+// A limit; on a bipolar bench it applies to both signs.
+export function limitOf(state, v = state.limit_v) {
+  const sign = state.low_v < 0 ? "±" : "";
+  return `${sign}${fixed(v, 3)} V (${sign}${fixed(v * state.gain / 1000, 2)} kV)`;
+}
 
 // Two steps: read the limits, then type one. With a study, the bench is armed to play it.
 export function Arming({ state, link, say, study = null, onArmed = () => {} }) {
   const [request, setRequest] = useState(null);
   const [limit, setLimit] = useState("");
+  const typed = useNumber(limit, { rule: { low: 0, high: state.high_v }, input: setLimit });
   const [known, setKnown] = useState(false);
   const [sent, setSent] = useState(false);
   const open = useRef(false); // whether a request waits for the second step
@@ -22,7 +30,9 @@ export function Arming({ state, link, say, study = null, onArmed = () => {} }) {
   }
   async function arm(event) {
     event.preventDefault();
-    const values = { number: request.number, limit_v: Number(limit), acknowledged: known ? request.reason : "" };
+    const limit_v = typed.read();
+    if (limit_v === null) return;
+    const values = { number: request.number, limit_v, acknowledged: known ? request.reason : "" };
     if (study !== null) values.study = study;
     setSent(true);
     const obstacle = await stopObstacle();
@@ -39,10 +49,10 @@ export function Arming({ state, link, say, study = null, onArmed = () => {} }) {
     <p>${request.limits}</p>
     ${request.reason && html`<p class="error">The bench was made safe. Reason: ${request.reason}</p>
       <label><input type="checkbox" checked=${known} onChange=${(e) => setKnown(e.target.checked)} /> The cause has been removed.</label>`}
-    <label>Highest drive of this run, in V at the amplifier's input, at most ${kilo(state.high_v, state.gain)}
-      <input type="number" step="any" min="0" max=${state.high_v} required value=${limit} onInput=${(e) => setLimit(e.target.value)} />
-    </label>
-    <div class="row"><button class="danger" type="submit" disabled=${sent || !limit || (request.reason && !known)}>${sent ? "Checking …" : study === null ? "Arm" : "Arm and play"}</button>
+    <label>Highest drive of this run, in V at the amplifier's input, at most ${limitOf(state, state.high_v)}
+      <input ...${typed.field} />
+    </label>${typed.line}
+    <div class="row"><button class="danger" type="submit" disabled=${sent || (request.reason && !known)}>${sent ? "Checking …" : study === null ? "Arm" : "Arm and play"}</button>
     <button type="button" onClick=${cancel}>Cancel</button></div>
   </form>`;
 }
@@ -59,7 +69,7 @@ export function Progress({ state }) {
 export function Playing({ state, link, say }) {
   const ask = (what, values = {}) => link.ask(what, values).then((found) => say(found.error || ""));
   return html`
-    <p class="badge live">Playing a study, up to ${kilo(state.limit_v, state.gain)}</p>
+    <p class="badge live">Playing a study, up to ${limitOf(state)}</p>
     <${Progress} state=${state} />
     ${state.prompt && html`<div class="card warning" role="alert"><p>${state.prompt}</p>
       <button type="button" onClick=${() => ask("confirm", { step: state.step })}>Done</button></div>`}

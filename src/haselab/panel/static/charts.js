@@ -84,6 +84,8 @@ export class Charts {
     ctx.strokeStyle = ctx.fillStyle = colour;
     ctx.font = `${11 * ratio}px system-ui, sans-serif`;
     ctx.setLineDash([4 * ratio, 4 * ratio]);
+    ctx.textAlign = "left"; // uPlot leaves another
+    ctx.textBaseline = "alphabetic";
     let free = -Infinity; // where the last text ends
     for (const [at_s, what] of this.events) {
       if (at_s < u.scales.x.min || at_s > u.scales.x.max) continue;
@@ -92,9 +94,11 @@ export class Charts {
       ctx.moveTo(x, bbox.top);
       ctx.lineTo(x, bbox.top + bbox.height);
       ctx.stroke();
-      if (x < free) continue;
-      ctx.fillText(label, x + 4 * ratio, bbox.top + 12 * ratio);
-      free = x + ctx.measureText(label).width + 8 * ratio;
+      const width = ctx.measureText(label).width + 4 * ratio, fits = x + width < bbox.left + bbox.width;
+      const from = fits ? x + 4 * ratio : x - width; // at the right edge, before the line
+      if (from < free) continue;
+      ctx.fillText(label, from, bbox.top + 12 * ratio);
+      free = from + width;
     }
     ctx.restore();
   }

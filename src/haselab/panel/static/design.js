@@ -1,6 +1,7 @@
 // Margins, frequency response and step of the identified model, with gains to drag.
 import { html, useState, useEffect, useRef } from "/static/vendor/htm-preact.js";
 import { resolved } from "/static/charts.js";
+import { useNumber } from "/static/number.js";
 
 const STEPS = 400; // of a slider; 0 is a gain of 0, the rest is logarithmic
 const DECADES = 4;
@@ -103,18 +104,13 @@ function Budget({ found }) {
 }
 
 function Gain({ about, value, highest, put }) {
-  const [typed, type] = useState(null); // while it is being typed
-  const commit = () => {
-    if (typed !== null && typed !== "" && Number(typed) >= 0) put(Number(typed));
-    type(null);
-  };
+  const typed = useNumber(String(value), { rule: { low: 0 }, enter: put, leave: "commit" });
   const label = `${about.label}${about.unit ? ` in ${about.unit}` : ""}`;
   return html`<div class="gain">
     <label for=${about.name}>${label}</label>
     <input id=${about.name} type="range" min="0" max=${STEPS} step="1" value=${toPosition(value, highest)} aria-valuetext=${`${value} ${about.unit}`}
       onInput=${(e) => put(toGain(Number(e.target.value), highest))} />
-    <input type="number" aria-label=${`${label}, typed`} min="0" step="any" value=${typed ?? String(value)} onInput=${(e) => type(e.target.value)}
-      onBlur=${commit} onKeyDown=${(e) => e.key === "Enter" && commit()} /></div>`;
+    <input aria-label=${`${label}, typed`} ...${typed.field} />${typed.line}</div>`;
 }
 
 export default function Design({ link, state }) {

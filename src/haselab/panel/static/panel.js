@@ -1,7 +1,8 @@
 import { html, render, useState, useEffect, useReducer } from "/static/vendor/htm-preact.js";
 import { Charts } from "/static/charts.js";
 import { Link } from "/static/link.js";
-import { Arming, Playing, Progress, kilo } from "/static/bench.js";
+import { Arming, Playing, Progress, kilo, limitOf } from "/static/bench.js";
+import { useNumber } from "/static/number.js";
 
 const STALE_MS = 450;
 const MOST_PAUSE_MS = 1000; // between two draws
@@ -53,17 +54,15 @@ function zoom({ from, to, key, event }) {
 }
 
 function Slider({ name, unit, low, high, step, value, send, about }) {
-  const [typed, type] = useState(null); // while it is being typed
   const [sent, setSent] = useState(null); // until the bench has it
   useEffect(() => setSent(null), [value]);
-  const put = (text) => { setSent(text); send(Number(text)).then((found) => { if (found.error || found.answer?.note) setSent(null); }); };
+  const put = (number) => { setSent(String(number)); send(number).then((found) => { if (found.error || found.answer?.note) setSent(null); }); };
   const now = sent ?? String(Number(value.toPrecision(6)));
-  const commit = () => { if (typed !== null && typed !== "") put(typed); type(null); };
+  const typed = useNumber(now, { least: low, most: high, enter: put, leave: "reset" });
   return html`<label>${name}, in ${unit}${about ? `: ${about}` : ""}
-    <input type="range" min=${low} max=${high} step=${step} value=${now} onInput=${(e) => put(e.target.value)} /></label>
+    <input type="range" min=${low} max=${high} step=${step} value=${now} onInput=${(e) => put(Number(e.target.value))} /></label>
     <label>${name}, typed, in ${unit} (press Enter)
-    <input type="number" min=${low} max=${high} step="any" value=${typed ?? now} onInput=${(e) => type(e.target.value)}
-      onBlur=${() => type(null)} onKeyDown=${(e) => e.key === "Enter" && commit()} /></label>`;
+    <input ...${typed.field} /></label>${typed.line}`;
 }
 
 function Live({ state, say }) {
@@ -73,11 +72,12 @@ function Live({ state, say }) {
   if (state.mode === "study") return html`<${Playing} state=${state} link=${link} say=${say} />`;
   return html`
     ${note && html`<p role="status">${note}</p>`}
-    <p class="badge live">Armed by this page up to ${kilo(state.limit_v, state.gain)}</p>
+    <p class="badge live">Armed by this page up to ${limitOf(state)}</p>
+    <p>The sensing signal is on, also while the drive is 0 V.</p>
     <${Slider} name="Drive" unit="V" low=${low} high=${state.limit_v} step="0.01" value=${state.target_v}
       about=${`now ${kilo(state.drive_v, state.gain)}, ${state.mode === "loop" ? "set by the controller" : `changes by 1 V/s (${Number((state.gain / 1000).toPrecision(3))} kV/s at the output)`}`} send=${(v) => ask("drive", { value_v: v })} />
     ${state.loop === null
-      ? html`<p>The loop cannot be closed. Start the panel with --actuator A.toml, a file with both maps and a controller.</p>`
+      ? html`<p>The loop cannot be closed. Start the panel with <code>--actuator actuator.toml</code>, a file with both maps and a controller. To make one from example records, run <code>haselab example actuator</code> and follow its README.md.</p>`
       : html`<${Slider} name="Desired strain" unit="%" low=${100 * state.loop[0]} high=${100 * state.loop[1]} step="0.1"
           value=${100 * (state.reference ?? 0)} about=${state.mode === "loop" ? "closed loop" : "the loop is open; moving this slider closes it, and the drive jumps to what the controller puts out"}
           send=${(v) => ask("loop", { strain: v / 100 })} />`}
@@ -116,6 +116,8 @@ function Camera({ filming }) {
       <p>${points.length ? `${points.length} fiducials found. The largest motion since the first picture is ${moved.toFixed(1)} px.` : "The fiducials are not found in this picture."}</p>`
       : html`<p>No picture. The camera starts when the bench is armed.</p>`}</div>`;
 }
+
+const STAGES = { requested: "arming, waiting for the typed limit" }; // in other words than those of the program
 
 // Each is a module with a default component, imported when it is first opened.
 const TABS = {
@@ -156,7 +158,7 @@ function Panel() {
     <header>
       <h1>${state ? state.name : "haselab panel"}</h1>
       ${state?.simulated && html`<span class="badge">SIMULATED</span>`}
-      <span class=${`badge ${live ? "live" : ""} ${state?.stage === "tripped" ? "bad" : ""}`} role="status">${state ? `Bench: ${state.stage}${live ? `, ${kilo(state.drive_v, state.gain)}` : ""}` : "Bench: unknown"}</span>
+      <span class=${`badge ${live ? "live" : ""} ${state?.stage === "tripped" ? "bad" : ""}`} role="status">${state ? `Bench: ${STAGES[state.stage] ?? state.stage}${live ? `, ${kilo(state.drive_v, state.gain)}` : ""}` : "Bench: unknown"}</span>
       <span id="age" class=${`badge ${stale ? "bad" : ""}`} role="status">${stale ? age : paused ? "VIEW PAUSED" : "data live"}</span>
     </header>
     <nav class="row" aria-label="Pages">
@@ -182,7 +184,7 @@ function Panel() {
           ${state?.reason && html`<p class=${state.stage === "tripped" ? "error" : ""}>Last message of the bench: ${state.reason}</p>`}
           ${state === null ? html`<p>No data from the bench process. If this does not change, read the messages in the terminal of haselab panel.</p>`
             : mine ? html`<${Live} state=${state} say=${say} />`
-            : live ? html`<p class="badge live">Armed by another page up to ${kilo(state.limit_v, state.gain)}</p>
+            : live ? html`<p class="badge live">Armed by another page up to ${limitOf(state)}</p>
               ${state.mode === "study" && html`<p>It plays a study.</p><${Progress} state=${state} />`}`
             : html`<${Arming} state=${state} link=${link} say=${say} />`}
         </div>

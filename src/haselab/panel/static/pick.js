@@ -1,5 +1,6 @@
 // Points, a ruler and a region on a frame of a video, for haselab track.
 import { html, useState, useEffect, useLayoutEffect, useMemo, useRef } from "/static/vendor/htm-preact.js";
+import { numberOf, useNumber } from "/static/number.js";
 
 const REACH = { mouse: 12, touch: 24, pen: 16 }; // to a mark, in px of the screen
 const SNAP = 24; // to a dot, in px of the screen
@@ -188,11 +189,11 @@ function Picture({ picture, index, work, chosen, choose, mode, add, drawn, settl
 
 function Chosen({ mark, work, picture, remove }) {
   const put = (at) => work.change(moved(mark.id, at));
-  const coordinate = (axis) => html`<label>${axis}, in px <input type="number" step="0.1" value=${mark[axis]}
-    onChange=${(e) => e.target.value !== "" && put(inside(axis === "x" ? Number(e.target.value) : mark.x, axis === "y" ? Number(e.target.value) : mark.y, picture))} /></label>`;
+  const moveTo = (axis) => (value) => put(inside(axis === "x" ? value : mark.x, axis === "y" ? value : mark.y, picture));
+  const [x, y] = ["x", "y"].map((axis) => useNumber(String(mark[axis]), { step: 0.1, least: 0, enter: moveTo(axis), stepped: moveTo(axis), leave: "commit" }));
   return html`<div role="group" aria-label="Selected mark">
     ${mark.kind === "point" ? html`<label>Name <input type="text" maxlength="60" value=${mark.name} onChange=${(e) => put({ name: e.target.value })} /></label>` : html`<p>${mark.name}</p>`}
-    <div class="row">${coordinate("x")}${coordinate("y")}<button type="button" onClick=${remove}>Delete</button></div></div>`;
+    <div class="row"><label>x, in px <input ...${x.field} /></label><label>y, in px <input ...${y.field} /></label><button type="button" onClick=${remove}>Delete</button></div>${x.line}${y.line}</div>`;
 }
 
 function Picker({ link }) {
@@ -207,6 +208,7 @@ function Picker({ link }) {
   const [table, setTable] = useState("");
   const [moveAside, setMoveAside] = useState(false);
   const [scale, setScale] = useState("");
+  const [scaleError, setScaleError] = useState(""); // also of the answer to Save; shown once
   const [said, say] = useState({ text: "", bad: false });
   const [done, setDone] = useState(null);
   const [pending, setPending] = useState(0); // searches for dots without an answer yet
@@ -235,6 +237,7 @@ function Picker({ link }) {
   function open(name) {
     if (name !== kept.video) work.clear();
     kept.video = name;
+    say({ text: "", bad: false });
     setVideo(name); setTable(""); setDone(null); setPicture(null); choose(null); view.whole();
     if (name) show(name, 0);
   }
@@ -249,7 +252,7 @@ function Picker({ link }) {
 
   useEffect(() => {
     const shortcut = (event) => {
-      if (!(event.ctrlKey || event.metaKey) || event.target.matches?.("input[type=text], input[type=number]")) return;
+      if (!(event.ctrlKey || event.metaKey) || event.target.matches?.("input[type=text]")) return;
       const key = event.key.toLowerCase();
       if (key === "z" && !event.shiftKey) work.undo();
       else if (key === "y" || key === "z") work.redo();
@@ -263,17 +266,25 @@ function Picker({ link }) {
   useEffect(() => { card.current?.scrollIntoView({ block: "nearest" }); }, [done]);
 
   const ends = work.marks.filter((one) => one.kind === "ruler");
-  const ruler = ends.length === 2 && Number(work.length) > 0 ? [ends[0].x, ends[0].y, ends[1].x, ends[1].y, Number(work.length)] : null;
+  const lengthRule = { above: 0 }, distance = numberOf(work.length, lengthRule).value;
+  const typedLength = useNumber(work.length, { rule: lengthRule, least: 0, input: (length) => work.change((old) => ({ ...old, length })) });
+  const typedCount = useNumber(count, { rule: { low: 1, high: 5000, whole: true }, input: setCount });
+  const ruler = ends.length === 2 && distance !== null ? [ends[0].x, ends[0].y, ends[1].x, ends[1].y, distance] : null;
   useEffect(() => {
+    setScaleError("");
     if (ruler === null) { setScale(""); return undefined; }
     let current = true;
     link.request("pick-scale", { ruler }).then((found) => {
       if (!current) return;
       const { value, std } = found.scale_mm_per_px ?? {};
-      setScale(found.error ?? `${Number(value.toPrecision(6))} ± ${Number(std.toPrecision(2))} mm per px`);
+      setScaleError(found.error ?? "");
+      setScale(found.error ? "" : `${Number(value.toPrecision(6))} ± ${Number(std.toPrecision(2))} mm per px`);
     });
     return () => { current = false; };
   }, [JSON.stringify(ruler)]);
+
+  // An error is about what was there: it ends with the next change.
+  useEffect(() => { say((old) => (old.bad ? { text: "", bad: false } : old)); }, [work.marks, work.length, table, moveAside, count, mode]);
 
   // Until all answers have come, nothing is saved: marks would be missing.
   async function searched(name, values) {
@@ -322,8 +333,10 @@ function Picker({ link }) {
     work.change((old) => ({ ...old, marks: old.marks.filter((one) => one.id !== chosen) }));
   }
   async function find() {
+    const most = typedCount.read();
+    if (most === null) return;
     const corners = pair("region").flatMap((one) => [one.x, one.y]);
-    const found = await searched("pick-region", { video, frame: 0, corners, count: Number(count) });
+    const found = await searched("pick-region", { video, frame: 0, corners, count: most });
     if (found.error) { fail(found); return; }
     work.change((old) => {
       const free = found.points.filter(([, x, y]) => !old.marks.some((one) => one.kind === "point" && Math.hypot(one.x - x, one.y - y) < 3));
@@ -332,6 +345,7 @@ function Picker({ link }) {
     say({ text: `${found.points.length} points in the region: ${found.why.join("; ")}.`, bad: false });
   }
   async function save() {
+    if (work.length.trim() !== "" && typedLength.read() === null) { fail({ error: "Not saved, because the distance in Scale is not valid." }); return; }
     const points = work.marks.filter((one) => one.kind === "point").map((one) => [one.name, one.x, one.y]);
     const found = await link.request("pick-save", { video, points, ruler, table: list.only ? "" : table, move: moveAside });
     if (found.error) { fail(found); return; }
@@ -379,11 +393,12 @@ function Picker({ link }) {
           <div class="marks">${work.marks.map((one) => html`<button type="button" aria-pressed=${one.id === chosen} onClick=${() => choose(one.id)}>${one.name} <small>${one.x.toFixed(1)}, ${one.y.toFixed(1)}</small></button>`)}</div></div>
         <div class="card"><h2>Scale</h2>
           <p>Press Scale and pick two points at a known distance.</p>
-          <label>Distance, in mm <input type="number" min="0" step="any" value=${work.length} onInput=${(e) => work.change((old) => ({ ...old, length: e.target.value }))} /></label>
-          <p role="status">${scale || (ends.length < 2 ? `${ends.length} of 2 points picked.` : "Type the distance.")}</p></div>
+          <label>Distance, in mm <input ...${typedLength.field} /></label>${typedLength.line}
+          ${scaleError && scaleError !== said.text && html`<p class="error" role="alert">${scaleError}</p>`}
+          <p role="status">${scaleError ? "" : scale || (ends.length < 2 ? `${ends.length} of 2 points picked.` : distance === null ? "Type the distance." : "")}</p></div>
         <div class="card"><h2>Region</h2>
           <p>Press Region and draw a rectangle to find all dots in it.</p>
-          <label>At most this many <input type="number" min="1" max="5000" value=${count} onInput=${(e) => setCount(e.target.value)} /></label>
+          <label>At most this many <input ...${typedCount.field} /></label>${typedCount.line}
           <button type="button" disabled=${pair("region").length < 2} onClick=${find}>Find the dots in the region</button></div>
         <div class="card"><h2>Save</h2>
           ${list.only ? html`<p><code>${table}</code></p>` : html`<label>File name of the table <input type="text" value=${table} onInput=${(e) => setTable(e.target.value)} /></label>`}

@@ -1,6 +1,6 @@
 // Choose, check and play a study; the list of recordings.
 import { html, useState, useEffect, useMemo } from "/static/vendor/htm-preact.js";
-import { Arming, Playing, Progress, kilo } from "/static/bench.js";
+import { Arming, Playing, Progress, fixed, kilo, limitOf } from "/static/bench.js";
 
 const number = (v) => (v === null || v === undefined ? "" : Number(v.toPrecision(5)));
 const clock = new Intl.DateTimeFormat("sv-SE", { dateStyle: "short", timeStyle: "medium" }); // as in the names of the folders
@@ -37,7 +37,7 @@ function Chooser({ link, state, mine, onEnd }) {
   if (busy && state.mode === "study" && mine) return html`<div class="card warning"><h2>Study</h2>
     ${error && html`<p class="error" role="alert">${error}</p>`}<${Playing} state=${state} link=${link} say=${say} /></div>`;
   if (busy && state.mode === "study") return html`<div class="card warning"><h2>Study</h2>
-    <p class="badge live">Another page plays a study, up to ${kilo(state.limit_v, state.gain)}</p><${Progress} state=${state} /></div>`;
+    <p class="badge live">Another page plays a study, up to ${limitOf(state)}</p><${Progress} state=${state} /></div>`;
   if (list === null) return html`<div class="card"><h2>Study</h2><p class=${error ? "error" : ""} role="status">${error || "Reading the studies …"}</p></div>`;
   const titles = list.find((one) => one.name === chosen.study)?.experiments ?? [];
   const toggle = (table, on) => change({ experiments: titles.map((one) => one.table).filter((one) => (one === table ? on : chosen.experiments.includes(one))) });
@@ -55,10 +55,10 @@ function Chooser({ link, state, mine, onEnd }) {
     ${checked === "checking" && html`<p role="status">Checking the study against the limits of the bench …</p>`}
     ${checked !== null && checked !== "checking" && html`
       <p role="status">${!checked.rated ? "The rating of this bench is not known (the rig file has no [rating]), so the study was not checked against it."
-        : checked.ok ? `The bench can play this study. It takes ${when(checked.seconds)} on the clock of the bench, and up to ${kilo(checked.highest_v, state?.gain ?? 1)}.` : "The bench cannot play this study."}</p>
-      ${checked.checks.length > 0 && html`<table><thead><tr><th scope="col">Check</th><th scope="col">Where</th><th scope="col">Needed</th><th scope="col">Limit</th><th scope="col">What to do</th></tr></thead>
-        <tbody>${checked.checks.map((one) => html`<tr><td>${one.name}</td><td>${one.where}</td><td class=${one.ok ? "" : "error"}>${number(one.requested)} ${one.unit}</td>
-          <td>${number(one.limit)} ${one.unit}</td><td>${one.ok ? "nothing" : one.advice}</td></tr>`)}</tbody></table>`}
+        : checked.ok ? `The bench can play this study. It takes ${when(checked.seconds)} on a real bench${state?.simulated ? "; this simulated bench may be faster" : ""}. Its highest drive is ${kilo(checked.highest_v, state?.gain ?? 1)}.` : "The bench cannot play this study."}</p>
+      ${checked.checks.length > 0 && html`<table class="wide"><thead><tr><th scope="col">Check</th><th scope="col">Where</th><th scope="col">Needed</th><th scope="col">Limit</th><th scope="col">What to do</th></tr></thead>
+        <tbody>${checked.checks.map((one) => html`<tr><td data-label="Check">${one.name}</td><td data-label="Where">${one.where}</td><td data-label="Needed" class=${one.ok ? "" : "error"}>${number(one.requested)} ${one.unit}</td>
+          <td data-label="Limit">${number(one.limit)} ${one.unit}</td><td data-label="What to do">${one.ok ? "nothing" : one.advice}</td></tr>`)}</tbody></table>`}
       ${checked.ok && (busy ? html`<p>${mine ? "The bench is armed. Disarm it on the page Live before you play a study." : "The bench is armed by another page. Disarm it there before you play a study."}</p>`
         : state && html`<${Arming} state=${state} link=${link} say=${say} study=${{ ...chosen, sha256: checked.sha256 }} onArmed=${() => setChecked(null)} />`)}`}
   </div>`;
@@ -70,11 +70,11 @@ function Comparison({ link, names, close }) {
   if (found === null) return html`<p role="status">Comparing …</p>`;
   if (found.error) return html`<p class="error" role="alert">${found.error}</p>`;
   const cell = (one) => (one === null ? "–" : html`${number(one.value)} <small>[${number(one.ci95[0])}, ${number(one.ci95[1])}]</small>`);
-  return html`<div class="card"><h2>Comparison</h2><p>Difference: second minus first, divided by their combined standard deviation. Values beyond 3 are red.</p>
+  return html`<div class="card"><h2>Comparison</h2><p>Difference: ${names[1]} minus ${names[0]}, divided by their combined standard deviation. Values beyond 3 are red.</p>
     <button type="button" onClick=${close}>Close</button>
-    <table><thead><tr><th scope="col">Row</th><th scope="col">Name</th><th scope="col">Unit</th><th scope="col">${names[0]}</th><th scope="col">${names[1]}</th><th scope="col">Difference</th></tr></thead>
-    <tbody>${found.rows.map((one) => html`<tr><td>${one.id}</td><td>${one.name}</td><td>${one.unit}</td><td>${cell(one.first)}</td><td>${cell(one.second)}</td>
-      <td class=${Math.abs(one.deviations) > 3 ? "error" : ""}>${one.deviations === null ? "–" : one.deviations.toFixed(1)}</td></tr>`)}</tbody></table></div>`;
+    <table class="wide"><thead><tr><th scope="col">Row</th><th scope="col">Name</th><th scope="col">Unit</th><th scope="col">${names[0]}</th><th scope="col">${names[1]}</th><th scope="col">Difference</th></tr></thead>
+    <tbody>${found.rows.map((one) => html`<tr><td data-label="Row">${one.id}</td><td data-label="Name">${one.name}</td><td data-label="Unit">${one.unit}</td><td data-label=${names[0]}>${cell(one.first)}</td><td data-label=${names[1]}>${cell(one.second)}</td>
+      <td data-label="Difference" class=${Math.abs(one.deviations) > 3 ? "error" : ""}>${one.deviations === null ? "–" : fixed(one.deviations, 1)}</td></tr>`)}</tbody></table></div>`;
 }
 
 const drafts = new Map(); // notes that are typed and not saved, by recording, with the note that was shown before
@@ -145,12 +145,12 @@ function Recordings({ link, mode, recording }) {
     <p>${found.recordings.length} in ${found.folder}</p>
     <label>Search <input type="search" value=${search} onInput=${(e) => setSearch(e.target.value)} /></label>
     <div class="row"><button type="button" disabled=${marked.length !== 2} onClick=${() => setCompared(marked)}>Compare the two that are marked</button></div>
-    <table><thead><tr><th scope="col">Mark</th><th scope="col">Recording</th><th scope="col">Study</th><th scope="col">Ended</th><th scope="col">Note</th><th scope="col">Results</th></tr></thead>
+    <table class="wide"><thead><tr><th scope="col">Mark</th><th scope="col">Recording</th><th scope="col">Study</th><th scope="col">Ended</th><th scope="col">Note</th><th scope="col">Results</th></tr></thead>
     <tbody>${all.slice(0, most).map((one) => html`<tr key=${one.name}>
-      <td><input type="checkbox" aria-label=${`Mark ${one.name}`} checked=${marked.includes(one.name)} onChange=${(e) => toggle(one.name, e.target.checked)} /></td>
-      <td>${one.name}<br /><small>${local(one.opened)}</small></td><td>${one.study}</td><td>${one.name === recording ? "being recorded" : one.state}</td>
-      <td><${Note} name=${one.name} saved=${one.note} keep=${keep} /></td>
-      <td>${one.report ? html`<button type="button" onClick=${() => open(one.name)}>Report</button>` : ""}
+      <td data-label="Mark"><input type="checkbox" aria-label=${`Mark ${one.name}`} checked=${marked.includes(one.name)} onChange=${(e) => toggle(one.name, e.target.checked)} /></td>
+      <td data-label="Recording">${one.name}<br /><small>${local(one.opened)}</small></td><td data-label="Study">${one.study}</td><td data-label="Ended">${one.name === recording ? "being recorded" : one.state}</td>
+      <td data-label="Note"><${Note} name=${one.name} saved=${one.note} keep=${keep} /></td>
+      <td data-label="Results">${one.report ? html`<button type="button" onClick=${() => open(one.name)}>Report</button>` : ""}
         <button type="button" disabled=${one.analysing || one.open} onClick=${() => analyse(one.name)}>${one.analysing ? "Analysing …" : "Analyse"}</button>
         ${one.problem && html`<p class="error">${one.problem}</p>`}</td></tr>`)}</tbody></table>
     ${all.length > most && html`<p>The newest ${most} of ${all.length} are shown.</p><button type="button" onClick=${() => setMost(most + MOST_ROWS)}>Show more</button>`}</div>`;

@@ -183,3 +183,41 @@ def test_a_short_study_of_any_device_is_plausible_until_masses_are_swapped(name)
     stated_kg[heavy] = 0.6 * device.mass_kg
     swapped = replace(record.drive, mass_kg=stated_kg, load_n=GRAVITY_M_S2 * stated_kg)
     assert "masses, which may be swapped" in find_implausible(law, [replace(record, drive=swapped)])
+
+
+@pytest.mark.parametrize("inertia_kg", [0.5, 1.0, 2.0])
+def test_motion_above_the_resonance_is_no_wrong_sign(inertia_kg):
+    """There an actuator moves against its drive; the inertia is not known beforehand."""
+    law, edge_s = DeaStack(), np.linspace(0.0, 4.0, 401)
+    sine = np.sin(2.0 * np.pi * 6.0 * edge_s[:-1])
+    volt = 5e3 * np.sqrt(1.0 + sine)
+    weight = np.full(400, 0.2 * GRAVITY_M_S2)
+    drive = Drive(edge_s, volt, weight, np.full(400, 0.2), np.zeros(400))
+    sampled = SampledLaw(law, 8e3, added_inertia_kg=inertia_kg)
+    start, _ = sampled.at_rest(float(volt[0]), 0.0, float(weight[0]))
+    found = sampled.respond(drive, edge_s[:-1], start)
+    none, no = np.zeros(0, np.int64), np.zeros(0)
+    record = MotionRecord(
+        "sine", drive, edge_s[:-1], found.length_m, np.full(400, STD_M), none, none, no, no,
+        ("all",), np.zeros(400, np.int64), none,
+    )  # fmt: skip
+    assert find_implausible(law, [record]) == ""
+
+
+def test_changes_of_the_load_at_a_small_constant_voltage_are_no_motion_by_the_drive(seen):
+    law, record = seen
+    offset = replace(record.drive, voltage_v=np.full(200, 5.0))
+    assert find_implausible(law, [replace(record, drive=offset)]) == ""
+
+
+def test_a_rest_before_the_drive_is_not_clipped(seen):
+    """The first value after the voltage has changed is still that of the rest."""
+    law, record = seen
+    volt = np.where(np.arange(200) < 100, 0.0, np.linspace(0.0, 1.0, 200) * 5e3)
+    resting = replace(record, drive=replace(record.drive, voltage_v=volt))
+    length_m = np.concatenate([
+        np.full(101, record.length_m[0]), record.length_m[0] + 1e-5 * np.arange(1, 100) ** 0.5,
+    ])  # fmt: skip
+    sign = -1.0 if record.length_m[-1] < record.length_m[0] else 1.0
+    length_m = record.length_m[0] + sign * (length_m - record.length_m[0])
+    assert "exactly" not in find_implausible(law, [replace(resting, length_m=length_m)])

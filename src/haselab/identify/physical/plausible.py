@@ -34,6 +34,7 @@ _TIME_SCALES = (1e-3, 60.0, 1e3)  # true over stated times: ms or min for s, s f
 # of the times, because the resonance at the start values may be off; the most likely ones first
 _TUNED = (1.0, 0.85, 1.2, 0.7, 1.4, 0.6, 1.7)
 _LONGEST_TUNED_S = 500.0
+_INERTIAS = (1.0, 3.0, 10.0, 30.0, 100.0)  # without weight, over the hung mass
 _ALIKE, _MORE_ALIKE = 0.6, 1.4  # correlation of steps: of right times; over that of wrong ones
 _LOW = 0.3  # of the highest voltage, below which the load decides the length
 _HEAVIER = 1.1  # load over another one, whose lengths are compared
@@ -68,7 +69,9 @@ def find_implausible(law: ActuatorLaw, records: Sequence[MotionRecord]) -> str:
     beginnings = [_beginning(record) for record in records if _seen_early(record).any()]
     lengths = [_simulated_m(law, record) for record in beginnings]
     for record, length_m in zip(beginnings, lengths, strict=True):
-        for fault in (_drive(law, record, length_m), _times(law, record), _sign(record, length_m)):
+        for fault in (
+            _drive(law, record, length_m), _times(law, record), _sign(law, record, length_m)
+        ):  # fmt: skip
             if fault:
                 return f"{record.name}: {fault}"
     return _loads(law, beginnings, lengths)
@@ -226,10 +229,16 @@ def _clipped(record: MotionRecord) -> str:
 
 
 def _stuck(at_end: NDArray[np.bool_], square_v2: Floats) -> int:
-    """Number of values in runs at the end of a range during which the voltage changes."""
+    """Number of values at the end of a range, in runs and after the voltage has changed in them.
+
+    The value at the first change is still that of the voltage before.
+    """
     edges = np.flatnonzero(np.diff(at_end, prepend=False, append=False))
-    runs = zip(edges[::2].tolist(), edges[1::2].tolist(), strict=True)
-    return sum(end - start for start, end in runs if np.ptp(square_v2[start:end]) > 0.0)
+    count = 0
+    for start, end in zip(edges[::2].tolist(), edges[1::2].tolist(), strict=True):
+        changed = np.flatnonzero(np.diff(square_v2[start:end]) != 0.0)
+        count += max(end - start - int(changed[0]) - 2, 0) if changed.size else 0
+    return count
 
 
 def _drive(law: ActuatorLaw, record: MotionRecord, simulated_m: Floats | None) -> str:
@@ -241,7 +250,10 @@ def _drive(law: ActuatorLaw, record: MotionRecord, simulated_m: Floats | None) -
     usual, noise_m = _usually_loaded(record), float(np.median(record.length_std_m))
     seen_m = record.length_m[usual]
     spread_m = float(np.std(seen_m))
+    if float(np.ptp(record.drive.voltage_v)) == 0.0:
+        return ""
     moves = moved_m < _UNSEEN * noise_m and spread_m > _STILL * noise_m
+    moves = moves and float(np.ptp(record.drive.load_n)) == 0.0  # else the load may have moved it
     if simulated_m is not None and moved_m < _LITTLE * spread_m:
         moves = moves or _correlation(seen_m, simulated_m[usual]) > _FOLLOWS
     if not moves:
@@ -277,13 +289,16 @@ def _moved_m(law: ActuatorLaw, record: MotionRecord, voltage_v: float) -> float 
     return abs(at_m - rest_m)
 
 
-def _simulated_m(law: ActuatorLaw, record: MotionRecord, time_scale: float = 1.0) -> Floats | None:
+def _simulated_m(
+    law: ActuatorLaw, record: MotionRecord, time_scale: float = 1.0, inertia: float = 0.0
+) -> Floats | None:
     """Lengths that the start values give; None where they describe no motion. Shape `(F,)`.
 
     Args:
         law: at the start values.
         record: with what acted, and when the lengths were seen.
         time_scale: true over stated times.
+        inertia: without weight, over the hung mass.
     """
     drive = record.drive
     scaled = replace(
@@ -293,7 +308,7 @@ def _simulated_m(law: ActuatorLaw, record: MotionRecord, time_scale: float = 1.0
         exposure_s=time_scale * record.exposure_s,
     )
     mass_kg = float(drive.mass_kg.max())
-    start = Unknowns.of(law, added_inertia_kg=0.0, mass_kg=mass_kg)
+    start = Unknowns.of(law, added_inertia_kg=inertia * mass_kg, mass_kg=mass_kg)
     try:
         return model_record(start, scaled, derivatives=False).length_m
     except HaselabError:
@@ -343,6 +358,8 @@ def _times(law: ActuatorLaw, record: MotionRecord) -> str:
     for scale in _TIME_SCALES if stated < _ALIKE else ():
         other = _agreement(law, record, scale)
         if other > max(_ALIKE, _MORE_ALIKE * stated):
+            if _follows_with_inertia(law, record):
+                return ""
             change = f"{scale:g} times longer" if scale > 1.0 else f"{1.0 / scale:g} times shorter"
             return (
                 "the lengths do not follow the drive as an actuator does, but they would if all "
@@ -350,6 +367,17 @@ def _times(law: ActuatorLaw, record: MotionRecord) -> str:
                 "Check the unit of the times (s)"
             )
     return ""
+
+
+def _follows_with_inertia(law: ActuatorLaw, record: MotionRecord) -> bool:
+    """Whether the lengths follow the drive as those of an actuator with a large inertia do."""
+    for times in _INERTIAS:
+        simulated_m = _simulated_m(law, record, inertia=times)
+        if simulated_m is not None:
+            steps_m = np.diff(record.length_m), np.diff(simulated_m)
+            if _correlation(*steps_m) > _ALIKE:
+                return True
+    return False
 
 
 def _agreement(law: ActuatorLaw, record: MotionRecord, time_scale: float) -> float:
@@ -370,13 +398,15 @@ def _agreement(law: ActuatorLaw, record: MotionRecord, time_scale: float) -> flo
     return best
 
 
-def _sign(record: MotionRecord, simulated_m: Floats | None) -> str:
-    """Whether the lengths grow where the actuator contracts."""
+def _sign(law: ActuatorLaw, record: MotionRecord, simulated_m: Floats | None) -> str:
+    """Whether the lengths grow where the actuator contracts, with any inertia."""
     if simulated_m is None or float(np.ptp(record.drive.voltage_v)) == 0.0:
         return ""
     usual = _usually_loaded(record)
     found = _correlation(record.length_m[usual], simulated_m[usual])
     if found > -_FOLLOWS:
+        return ""
+    if _follows_with_inertia(law, record):  # above its resonance, it moves against the drive
         return ""
     return (
         f"the lengths grow where the actuator contracts (correlation with the simulated lengths: "
@@ -396,6 +426,11 @@ class _Level:
     most_m: float
     simulated_m: float
     noise_m: float
+
+    @property
+    def moved_m(self) -> float:
+        """Largest difference of these lengths."""
+        return self.most_m - self.least_m
 
 
 def _levels(record: MotionRecord, simulated_m: Floats) -> Iterator[_Level]:
@@ -442,7 +477,8 @@ def _loads(
         shorter_m = light.seen_m - heavy.seen_m
         if shorter_m <= max(_REVERSED * longer_m, _STILL * light.noise_m):
             continue
-        if light.least_m < heavy.most_m:  # still in motion after the last change of the load
+        # still in motion after the last change of the load
+        if light.least_m < heavy.most_m or shorter_m < max(light.moved_m, heavy.moved_m):
             continue
         # creep after the previous load may exceed the difference of two similar loads
         if longer_m > _DECIDES * _stretch_m(law, light.load_n, heavy.load_n):

@@ -67,11 +67,15 @@ class Watched:
         self.page.keyboard.type(text)
         self.page.keyboard.press("Enter")
         expect(self.page.locator(".number")).to_have_count(0)
+        self.expect_sent(sends, before)
+
+    def expect_sent(self, name: str, before: int = 0) -> None:
+        """Wait until a command was sent once more."""
         for _ in range(100):
-            if self.sent.count(sends) > before:
+            if self.sent.count(name) > before:
                 return
             self.page.wait_for_timeout(100)
-        pytest.fail(f"{sends} was not sent")
+        pytest.fail(f"{name} was not sent")
 
 
 def test_the_limit_the_drive_and_the_strain(browser: Browser, actuator_file: Path) -> None:
@@ -185,7 +189,7 @@ def test_the_numbers_of_a_picture(browser: Browser, tmp_path: Path) -> None:
             assert not list(video.parent.glob("*-points.csv"))
             most.fill("20")
             page.get_by_role("button", name="Find the dots").click()
-            expect(page.get_by_text("points in the region")).to_be_visible(timeout=WAIT_MS)
+            watched.expect_sent("pick-region")
     finally:
         ended(panel)
 

@@ -34,7 +34,7 @@ _TIME_SCALES = (1e-3, 60.0, 1e3)  # true over stated times: ms or min for s, s f
 # of the times, because the resonance at the start values may be off; the most likely ones first
 _TUNED = (1.0, 0.85, 1.2, 0.7, 1.4, 0.6, 1.7)
 _LONGEST_TUNED_S = 500.0
-_INERTIAS = (1.0, 3.0, 10.0, 30.0, 100.0)  # without weight, over the hung mass
+_INERTIAS = (3.0, 20.0)  # without weight, over the hung mass
 _ALIKE, _MORE_ALIKE = 0.6, 1.4  # correlation of steps: of right times; over that of wrong ones
 _LOW = 0.3  # of the highest voltage, below which the load decides the length
 _HEAVIER = 1.1  # load over another one, whose lengths are compared

@@ -29,6 +29,7 @@ __all__ = [
 ]  # fmt: skip
 
 Floats = NDArray[np.float64]
+_LEAST_RANK = 0.1  # correlation of a result that rises or falls, and does not do both
 _QUANTILES = {"p05": 0.05, "median": 0.5, "p95": 0.95}
 _SIDE = 0.025
 _EXACT = 1e-9  # width over the value: fits of records without noise have 1e-15 to 1e-11
@@ -132,13 +133,20 @@ def most_important(summary: Mapping[str, Any], rows: Sequence[CaseRow]) -> str:
                 unclear = True
                 continue
             near = "" if ends is None else f", {ends[0]:.2g} to {ends[1]:.2g}"
-            signed = is_sobol and "correlation" in one
-            sign = f"; rank correlation {one['correlation']['value']:.2g}" if signed else ""
+            sign = _direction(one) if is_sobol else ""
             text = f"{one['parameter']} ({kind} {number['value']:.2g}{near}{sign})"
             listed.append((-abs(number["value"]), text))
     if not listed:
         return f"{name}{place}: each {kind} has an interval that contains 0" if unclear else ""
     return f"{name}{place} depends most on {', '.join(text for _, text in sorted(listed)[:3])}"
+
+
+def _direction(found: Mapping[str, Any]) -> str:
+    """Whether a result rises or falls with a parameter, by their rank correlation."""
+    rank = found["correlation"]["value"] if "correlation" in found else 0.0
+    if not abs(rank) > _LEAST_RANK:
+        return ""
+    return ", rises" if rank > 0.0 else ", falls"
 
 
 def _over_axes(campaign: Campaign, groups: Sequence[Group], names: Sequence[str]) -> list[Json]:

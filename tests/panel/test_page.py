@@ -153,7 +153,8 @@ def test_recordings_have_the_local_time_of_their_folders(browser: Browser, tmp_p
 
 def test_a_bipolar_bench_shows_limits_of_both_signs(browser: Browser, tmp_path: Path) -> None:
     text = (RIGS / "twin-hz.toml").read_text()
-    (tmp_path / "rig.toml").write_text(text.replace("drive_low_v = 0.0", "drive_low_v = -2.0"))
+    (tmp_path / "twin.toml").write_text(text.replace("drive_low_v = 0.0", "drive_low_v = -2.0"))
+    (tmp_path / "rig.toml").write_text('kind = "twin"\ntwin = "twin.toml"\n')
     found = started("--rig", str(tmp_path / "rig.toml"))
     try:
         with browser.new_context() as context:

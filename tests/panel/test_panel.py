@@ -351,6 +351,8 @@ def test_pages_without_the_token_do_not_keep_one_with_it_from_connecting(
 def test_a_signal_ends_the_panel_and_all_its_processes(number: signal.Signals) -> None:
     panel = started()
     children = [panel.child(name) for name in ("bench_process", "stop_process")]
+    with urllib.request.urlopen(panel.address, timeout=WAIT_S) as page:
+        assert page.status == 200  # it serves, and so it handles signals
     assert ended(panel, number) == 0
     for child in children:
         with pytest.raises(ProcessLookupError, match="No such process"):

@@ -32,8 +32,6 @@ from haselab.store.toml import Section
 __all__ = ["CONTROLLER", "ControllerSettings"]
 
 _OVER_FIELD = 1.02  # of the permitted field: what a sensed length may miss, as on the scoreboard
-
-
 _MONITORS = (
     "twin.acquisition.rate_hz", "twin.acquisition.bits", "twin.acquisition.range_v",
     "twin.acquisition.v_noise_v", "twin.acquisition.i_noise_v",
@@ -116,8 +114,9 @@ def _scenario(
     task: Task, known: KnownActuator, mass_kg: float, rng: np.random.Generator
 ) -> Scenario:
     """The task, whose changes of the load are relative to the mass that hangs on the twin."""
-    asked = task.scenario(known, copy.deepcopy(rng))
-    return task.scenario(replace(known, mass_kg=mass_kg) if asked.loads else known, rng)
+    again = copy.deepcopy(rng)
+    asked = task.scenario(known, rng)
+    return task.scenario(replace(known, mass_kg=mass_kg), again) if asked.loads else asked
 
 
 def _entropy(rng: np.random.Generator) -> list[int]:

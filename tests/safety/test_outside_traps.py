@@ -133,23 +133,36 @@ def old_act(config: BenchConfig) -> bool:
     return False
 
 
+def all_at_once(config: BenchConfig, programs: int) -> list[list[tuple[str, str]]]:
+    """What each of these programs reports when they make a bench safe at the same time."""
+    found: list[list[tuple[str, str]]] = []
+    threads = [
+        threading.Thread(target=lambda: found.append(make_safe(config))) for _ in range(programs)
+    ]
+    for each in threads:
+        each.start()
+    for each in threads:
+        each.join(GUARD_S)
+    return found
+
+
 def test_program_guardians_and_rig_safe_get_along_with_two_connections() -> None:
     with served() as twin:
         config = config_of(twin, supply=False)
         generator = KeysightGenerator(config.generator)
         generator.sine(2000.0, 0.02)
-        found: list[list[tuple[str, str]]] = []
-        threads = [
-            threading.Thread(target=lambda: found.append(make_safe(config))) for _ in range(3)
-        ]
-        for each in threads:
-            each.start()
-        for each in threads:
-            each.join(GUARD_S)
-        assert found == [[("daq", ""), ("generator", "")]] * 3
+        assert all_at_once(config, 3) == [[("daq", ""), ("generator", "")]] * 3
         assert carrier_v(twin) == 0.0
         assert generator.is_off()
         generator.close()
+
+
+def test_a_board_that_six_programs_make_safe_at_once_is_safe_for_each() -> None:
+    """Each resets the tasks of the others, again and again."""
+    with served() as twin:
+        config = config_of(twin, supply=False)
+        for _ in range(10):
+            assert [dict(rows)["daq"] for rows in all_at_once(config, 6)] == [""] * 6
 
 
 def test_with_both_connections_in_use_the_old_way_is_refused_and_the_new_one_waits() -> None:

@@ -4,8 +4,10 @@ from __future__ import annotations
 
 import contextlib
 import functools
+import random
 import re
 import threading
+import time
 from collections.abc import Iterator
 from typing import Any
 
@@ -27,6 +29,9 @@ _NO_CLOCK_ADVICE = (
     "If another program, such as 'haselab rig safe', has reset the board, start this program "
     "again; otherwise check daq.counter."
 )
+# Longest random pause after each attempt to shut down that met another program's attempt.
+_PAUSES_S = (0.01, 0.02, 0.04, 0.08, 0.16, 0.32)
+_CHANCE = random.Random()
 _SILENT_S = 2e-3  # timeout after a server has not replied once, so that the guardian acts soon
 # DAQmx status: meaning, what to do.
 _EXPLANATIONS = {
@@ -216,18 +221,30 @@ class NidaqLink:
     def shut_down(self) -> None:
         """Reset the device, then put out 0 V, since its power-up state may be another voltage.
 
+        Several programs may do this at the same time, each resetting the task of the others.
+
         Raises:
             DeviceError: The device does not reply.
         """
-        self.reset()
         with self.translated_errors():
-            task = self.task()
-            output = f"{self._config.device}/{self._config.output}"
-            task.ao_channels.add_ao_voltage_chan(output, min_val=-_FULL_V, max_val=_FULL_V)
-            try:
-                self.writer(task, auto_start=True).write_one_sample(0.0)
-            finally:
-                task.stop()  # the output stays, and is free for other programs
+            for longest_s in _PAUSES_S:
+                try:
+                    self._reset_to_zero()
+                except self._errors.DaqError:
+                    time.sleep(_CHANCE.uniform(0.0, longest_s))
+                else:
+                    return
+            self._reset_to_zero()
+
+    def _reset_to_zero(self) -> None:
+        self._device().reset_device()
+        task = self.task()
+        output = f"{self._config.device}/{self._config.output}"
+        task.ao_channels.add_ao_voltage_chan(output, min_val=-_FULL_V, max_val=_FULL_V)
+        try:
+            self.writer(task, auto_start=True).write_one_sample(0.0)
+        finally:
+            task.stop()  # the output stays, and is free for other programs
 
     def close(self) -> None:
         """Close tasks and connection. Never raises."""

@@ -40,7 +40,7 @@ from haselab.panel.columns import LiveWriter
 from haselab.panel.files import PanelFiles
 from haselab.panel.live_bench import CARRIER_HZ, LiveBench
 from haselab.panel.pages.study_job import StudyJob
-from haselab.panel.stop_process import COMMANDED
+from haselab.panel.stop_process import COMMANDED, rig_safe_runs
 from haselab.panel.study_player import StudyPlayer
 from haselab.pipelines.actuator_bench import prepare_bench
 from haselab.pipelines.design.model_file import read_tables
@@ -268,6 +268,7 @@ def main(words: list[str]) -> int:
                 bench = LiveBench(
                     guard(rig, safety), writer, read_loop, folder / "camera.jpg",
                     lambda chosen: StudyJob.of(files, file, chosen), player, lease_s,
+                    lambda: rig_safe_runs(folder),
                 )  # fmt: skip
                 threading.Thread(target=_end_study_at, args=(ended, bench), daemon=True).start()
                 link = _Link(folder, bench)

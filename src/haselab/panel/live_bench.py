@@ -79,6 +79,8 @@ class LiveBench:
         prepare: prepares the study that a page has chosen; None: no study can be played.
         player: plays it.
         lease_s: longest time without a message from the page that armed the bench, in s.
+        rig_safe_runs: whether the `haselab rig safe` that STOP has started still runs. Until it
+            has ended, it would end the next run.
     """
 
     def __init__(
@@ -90,9 +92,10 @@ class LiveBench:
         prepare: Callable[[JsonObject], StudyJob] | None = None,
         player: StudyPlayer | None = None,
         lease_s: float = 1.5,
+        rig_safe_runs: Callable[[], bool] = lambda: False,
     ) -> None:
         self._leases = PageLeases(lease_s)
-        self._rig = rig
+        self._rig, self._rig_safe_runs = rig, rig_safe_runs
         self._picture = None if picture is None else PictureFile(picture)
         self._read_loop, self._loop = read_loop, read_loop()
         self._signals, self._idle = LiveSignals(rig, writer, CARRIER_HZ), IdleWatch(rig)
@@ -414,6 +417,11 @@ class LiveBench:
     def _require_idle(self) -> None:
         if self._holder:
             raise SafetyError("The bench is armed already. Disarm it first.")
+        if self._rig_safe_runs():
+            raise SafetyError(
+                "STOP is still switching the instruments off ('haselab rig safe'). Try again in a "
+                "few seconds."
+            )
 
     def _require_armed(self, holder: str) -> None:
         if not self._holder or holder != self._holder or not self._rig.safety.live:

@@ -6,14 +6,18 @@ that no haselab program can energise the bench, and then makes the bench process
 (`stop.sock` in FOLDER). On a real bench it also starts `haselab rig safe RIG.toml`, which uses
 connections of its own; and if the bench process does not answer, it ends the lease in the
 interlock, so that the guardians act at once. STOP needs no token; pages of other origins are
-refused. `GET /ready` keeps the connection of a page open.
+refused. `GET /ready` keeps the connection of a page open. A message on the WebSocket `/socket` does
+the same as `POST /stop`, and a browser sends it sooner than a request; the page does both.
 
 This module uses only the standard library and the interlock, so it starts quickly.
 """
 
 from __future__ import annotations
 
+import base64
 import contextlib
+import fcntl
+import hashlib
 import json
 import os
 import socket
@@ -28,14 +32,17 @@ from typing import Any
 
 from haselab.safety.interlock import Interlock
 
-__all__ = ["COMMANDED", "StopServer", "main"]
+__all__ = ["COMMANDED", "StopServer", "main", "rig_safe_runs"]
 
 COMMANDED = b"0 V commanded"  # answer of the bench process; any other one is a fault
 _REASON = "STOP was pressed on the panel"
+_RIG_SAFE = "rig-safe.lock"  # in FOLDER, locked while `haselab rig safe` runs
 _NICENESS = -10
 _ANSWER_S = 2.0  # longest wait for the bench process
 _PROMPT_S = 0.5  # after which the guardians are called
 _TRIALS = 20  # to find a port that is free on all addresses
+_SOCKET_ID = b"258EAFA5-E914-47DA-95CA-C5AB0DC85B11"  # RFC 6455, section 1.3
+_TEXT, _MOST_BYTES = 1, 125  # of a WebSocket frame: its kind; longest payload with a short head
 _MOST_CONNECTIONS = 128  # at the same time; more than the pages need
 
 
@@ -103,7 +110,11 @@ class _Handler(BaseHTTPRequestHandler):
         super().setup()
 
     def do_GET(self) -> None:
-        if self._allowed():
+        if not self._allowed():
+            return
+        if self.path == "/socket" and "Sec-WebSocket-Key" in self.headers:
+            self._serve_socket(self.headers["Sec-WebSocket-Key"])
+        else:
             self._reply(200 if self.path == "/ready" else 404, {"ready": self.path == "/ready"})
 
     def do_POST(self) -> None:
@@ -116,6 +127,22 @@ class _Handler(BaseHTTPRequestHandler):
         size = self.headers.get("Content-Length") or ""
         with contextlib.suppress(OSError):  # what the page sent has no meaning
             self.rfile.read(min(int(size), 4096) if size.isdecimal() else 0)
+
+    def _serve_socket(self, key: str) -> None:
+        """Stop for each text frame; source: RFC 6455, sections 4.2.2 and 5.2."""
+        accepted = hashlib.sha1(key.encode() + _SOCKET_ID, usedforsecurity=False).digest()
+        self.send_response(101)
+        self.send_header("Upgrade", "websocket")
+        self.send_header("Connection", "Upgrade")
+        self.send_header("Sec-WebSocket-Accept", base64.b64encode(accepted).decode())
+        self.end_headers()
+        self.close_connection = True
+        self.connection.settimeout(None)
+        while len(head := self.rfile.read(2)) == 2 and head[1] & 0x7F <= _MOST_BYTES:
+            self.rfile.read(4 + (head[1] & 0x7F))  # mask and payload have no meaning
+            if head[0] & 0x0F != _TEXT:
+                return
+            self.server.stop()
 
     def _allowed(self) -> bool:
         host, origin = self.headers.get("Host", ""), self.headers.get("Origin")
@@ -154,16 +181,18 @@ class _Stop:
         begun_s = time.perf_counter()
         self._interlock.revoke(_REASON)
         revoked_s = time.perf_counter() - begun_s
-        if self._rig:
-            threading.Thread(target=self._rig_safe, daemon=True).start()
+        starting = threading.Thread(target=self._rig_safe, daemon=True)
+        starting.start()
         answer = self._tell_bench(_PROMPT_S)
         if answer != COMMANDED:
             self._interlock.lease(0.0)  # a guardian looks every 20 ms
         if not answer:
             answer = self._tell_bench(_ANSWER_S - _PROMPT_S)
+        commanded_s = time.perf_counter() - begun_s
+        starting.join(_PROMPT_S)  # so that nobody can arm the bench before it runs
         return {"revoked_ms": 1e3 * revoked_s, "commanded": answer == COMMANDED,
                 "fault": "" if answer == COMMANDED else answer.decode(errors="replace"),
-                "commanded_ms": 1e3 * (time.perf_counter() - begun_s)}  # fmt: skip
+                "commanded_ms": 1e3 * commanded_s}  # fmt: skip
 
     def _tell_bench(self, wait_s: float) -> bytes:
         """Send the bench process to 0 V; its answer, empty if there was none in time."""
@@ -179,11 +208,33 @@ class _Stop:
         return b""
 
     def _rig_safe(self) -> None:
-        """Start `haselab rig safe`, unless it is running."""
+        """Start `haselab rig safe` on a real bench, unless it is running."""
+        if not self._rig:
+            return
         with self._mutex:
             if self._safe is None or self._safe.poll() is not None:
                 command = [sys.executable, "-m", "haselab.cli", "rig", "safe", self._rig]
-                self._safe = subprocess.Popen(command, stdin=subprocess.DEVNULL)
+                with contextlib.ExitStack() as opened:
+                    locks: list[int] = []
+                    with contextlib.suppress(OSError):  # a full disk must not prevent it
+                        lock = opened.enter_context((self._folder / _RIG_SAFE).open("wb"))
+                        fcntl.flock(lock, fcntl.LOCK_SH)
+                        locks.append(lock.fileno())
+                    self._safe = subprocess.Popen(command, stdin=subprocess.DEVNULL, pass_fds=locks)
+
+
+def rig_safe_runs(folder: Path) -> bool:
+    """Whether the `haselab rig safe` that STOP has started still runs.
+
+    Args:
+        folder: of the panel.
+    """
+    with contextlib.suppress(FileNotFoundError), (folder / _RIG_SAFE).open("rb") as lock:
+        try:
+            fcntl.flock(lock, fcntl.LOCK_EX | fcntl.LOCK_NB)
+        except BlockingIOError:
+            return True
+    return False
 
 
 def _on_one_port(

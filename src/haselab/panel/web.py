@@ -57,7 +57,8 @@ _MOST_BYTES = 4096  # of a message of a page
 _MOST_COLUMNS = 4000
 _COLUMN_STEP = 100  # so that windows of almost the same width share their frames
 _BENCH_S = 10.0  # longest wait for an answer of the bench process
-_ARM_S = 30.0  # the same for arming, before which a study is checked; see `page_leases`
+_ARM_S = 30.0  # the same for `_SLOW`; see `page_leases`
+_SLOW = ("request", "arm")  # new guardians are started; a study is checked
 _HEAD = struct.Struct("<HHIddddII")
 
 
@@ -79,7 +80,8 @@ class WebSettings:
 
     def stop_sources(self) -> str:
         """Addresses of the stop process, which pages may request."""
-        return " ".join(f"http://{host}" for host in hosts_of(self.access.lan, self.stop_port))
+        hosts = hosts_of(self.access.lan, self.stop_port)
+        return " ".join(f"http://{host} ws://{host}" for host in hosts)
 
 
 class _Bench:
@@ -158,7 +160,7 @@ class _Bench:
                 "bench is at 0 V, then start the panel again."
             }
         self._number += 1
-        number, wait_s = self._number, _ARM_S if what == "arm" else _BENCH_S
+        number, wait_s = self._number, _ARM_S if what in _SLOW else _BENCH_S
         answer = self._waiting[number] = asyncio.get_running_loop().create_future()
         command = {"id": number, "do": what, "holder": holder, "values": values, "at_s": at_s}
         self._writer.write(json.dumps(command).encode() + b"\n")

@@ -277,7 +277,7 @@ def test_the_status_names_armed_benches_and_why_others_were_made_safe(
         gate.interlock.set_live(True)
         code, printed, _ = call(capsys, "rig", "status")
         assert code == 0
-        assert f"NI_01A2                 ARMED by process {os.getpid()}" in printed
+        assert f"NI_01A2  ARMED by process {os.getpid()}" in printed
         gate.interlock.set_live(False)
         gate.interlock.revoke("The strain is stuck.")
         (bench,) = json.loads(call(capsys, "rig", "status", "--json")[1])["benches"]

@@ -98,3 +98,26 @@ def test_an_error_of_the_clock_moves_the_estimates_as_far_as_the_intervals_allow
         # a search may end 0.3 standard deviations from the minimum
         assert moved[k] > std[k] and abs(expected[k] - moved[k]) < 0.3 * std[k], name
     assert not clock_std(misfit, right, 0.0, prior).any()
+
+
+@pytest.mark.parametrize("added_kg", [0.5, pytest.param(2.0, marks=pytest.mark.slow)])
+def test_an_inertia_above_the_hung_mass_is_found_from_a_chirp(added_kg):
+    """For example a lever or a plate, which the usual start of the search does not expect."""
+    mass_kg, rows, rng = 0.2, 1000, np.random.default_rng(12)
+    time_s, same = 0.02 * np.arange(rows), np.ones(rows)
+    volt = 8e3 * (0.6 + 0.35 * np.sin(2.0 * np.pi * (0.2 * time_s + 0.2 * time_s**2)))
+    volt[time_s < 1.0] = 0.0
+    drive = Drive(np.append(time_s, 0.02 * rows), volt, mass_kg * GRAVITY_M_S2 * same,
+                  (mass_kg + added_kg) * same, 0.0 * same)  # fmt: skip
+    sampled = SampledLaw(LAW, 10e3)
+    start, _ = sampled.at_rest(0.0, 0.0, mass_kg * GRAVITY_M_S2)
+    seen_m = sampled.respond(drive, time_s, start).length_m
+    record = motion_of_table(
+        "chirp", time_s, volt, mass_kg=mass_kg,
+        length_m=seen_m + LENGTH_STD_M * rng.standard_normal(rows),
+        capacitance_f=LAW.capacitance_f(seen_m) + CAPACITANCE_STD_F * rng.standard_normal(rows),
+    )  # fmt: skip
+    fit = fit_actuator(LAW, [record], mass_kg=mass_kg, camera_bias_m=5e-5)
+    assert fit.status == "ok", fit.status
+    found = fit.parameters["load.added_inertia_kg"]
+    assert abs(found.value - added_kg) < 4.0 * found.std < 0.1 * added_kg

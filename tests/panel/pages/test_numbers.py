@@ -112,8 +112,9 @@ def test_the_limit_the_drive_and_the_strain(browser: Browser, actuator_file: Pat
             watched.types(drive, "0.1", "drive")
             expect(page.locator("header")).to_contain_text("0.100 V", timeout=WAIT_MS)
             watched.refuses(strain)
-            watched.types(strain, "0.2", "loop")
-            expect(strain).to_have_value("0.2")
+            watched.types(strain, "0.2", "loop")  # more than 0.2 V reaches
+            expect(page.get_by_text("The desired strain was limited to")).to_be_visible()
+            expect(strain).to_have_value(re.compile(r"^-\d\.\d+$"))
             assert watched.sent == ["arm", "drive", "loop"]
     finally:
         ended(panel)

@@ -87,11 +87,14 @@ def test_ctrl_c_ends_the_program_while_a_search_runs(video: Path) -> None:
     )  # fmt: skip
     try:
         assert process.stderr is not None
-        panel = RunningPanel(process, process.stderr.readline().strip())
+        lines = [process.stderr.readline(), process.stderr.readline()]
+        assert "searching\n" in lines  # for the first frame, before anybody has clicked
+        address = next(line for line in lines if line.startswith("http"))
+        panel, sent = RunningPanel(process, address.strip()), threading.Event()
         body = json.dumps({"video": str(video), "frame": 0, **PLACE})
-        request = threading.Thread(target=_post, args=(panel, body), daemon=True)
+        request = threading.Thread(target=_post, args=(panel, body, sent), daemon=True)
         request.start()
-        assert "searching\n" in process.stderr  # reads until then
+        assert sent.wait(WAIT_S)
         process.send_signal(signal.SIGINT)
         assert process.wait(WAIT_S) == 130
         request.join(WAIT_S)
@@ -101,10 +104,11 @@ def test_ctrl_c_ends_the_program_while_a_search_runs(video: Path) -> None:
         process.communicate()
 
 
-def _post(panel: RunningPanel, body: str) -> None:
+def _post(panel: RunningPanel, body: str, sent: threading.Event) -> None:
     host, _, port = panel.host.partition(":")
     connection = http.client.HTTPConnection(host, int(port), timeout=WAIT_S)
     headers = {"X-Panel-Token": panel.token, "Content-Type": "application/json"}
     with contextlib.closing(connection), contextlib.suppress(OSError, http.client.HTTPException):
         connection.request("POST", "/request/pick-snap", body, headers)
+        sent.set()
         connection.getresponse().read()

@@ -488,10 +488,11 @@ def _safe_by_its_program(key: str, what: str = "program") -> tuple[str, str]:
 def status(as_json: bool, out: Path | None) -> None:
     """Show which benches of this computer are armed.
 
-    For the others it shows why they were made safe. It reads what programs have recorded since the
-    computer started. It does not contact any instrument: this is NOT a measurement of a voltage.
+    For the others it shows why they were made safe. The bench whose state changed last is first. It
+    reads what programs have recorded since the computer started. It does not contact any
+    instrument: this is NOT a measurement of a voltage.
     """
-    places = sorted(interlock_folder().glob("*.state"))
+    places = sorted(interlock_folder().glob("*.state"), key=_changed_s, reverse=True)
     benches = [_state_of(place.stem) for place in places]
     text = json.dumps({"benches": benches}, indent=2)
     if out is not None:
@@ -499,10 +500,19 @@ def status(as_json: bool, out: Path | None) -> None:
     if as_json:
         click.echo(text)
         return
+    width = max((len(place.stem) for place in places), default=0)
     for bench in benches:
-        click.echo(f"{bench['bench']:<24}{bench['state']}")
+        click.echo(f"{bench['bench']:<{width}}  {bench['state']}")
     if not benches:
         click.echo("No bench has been used since this computer started.")
+
+
+def _changed_s(place: Path) -> float:
+    """When a file was last written; 0 if it is gone."""
+    try:
+        return place.stat().st_mtime
+    except OSError:
+        return 0.0
 
 
 def _state_of(key: str) -> dict[str, object]:

@@ -148,6 +148,11 @@ def transfer(
             "--actuator."
         )
     if actuator is not None:
+        if options["nonlinear"]:
+            raise InputError(
+                f"--nonlinear {options['nonlinear']} excludes --actuator: [model] of an actuator "
+                "file is linear. Leave out one of them, or write the model with --out."
+            )
         load_actuator(actuator, to_write=True)  # before a long fit
     records: list[Record] = []
     origins: list[Path] = []
@@ -216,8 +221,8 @@ def _save(
     """Write [model] of the actuator file."""
     if isinstance(fit, NonlinearFit):
         raise InputError(
-            f"[model] of an actuator file needs a linear model, but the fit is {fit.kind}. Leave "
-            f"out --nonlinear, or write the model with --out. {actuator}"
+            f"[model] was not changed: it needs a linear model, but --choose found {fit.kind}. "
+            f"Leave out --choose nonlinear (or all), or write the model with --out. {actuator}"
         )
     section = model_section(fit, names, units)
     used = load_actuator(actuator).drive.voltage_map if through_map else None

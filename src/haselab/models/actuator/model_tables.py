@@ -23,6 +23,7 @@ __all__ = [
     "CovarianceTable",
     "EstimateTable",
     "LoopTable",
+    "NonlinearTable",
     "Number",
     "OriginTable",
     "PlantTable",
@@ -105,6 +106,16 @@ class RationalTable(_Table):
     delay_s: Annotated[Number, Field(ge=0, le=_LONGEST_S)] = 0.0
     input: str = "u"
     output: str = "y"
+
+
+class NonlinearTable(_Table):
+    """The nonlinear part of a model, as far as files state its numbers; see `NonlinearFit`."""
+
+    kind: str
+    operating_input: Number
+    gain: _Quantity
+    gain_2: _Quantity = 0.0
+    gain_3: _Quantity = 0.0
 
 
 class CovarianceTable(_Table):

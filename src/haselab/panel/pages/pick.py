@@ -175,19 +175,24 @@ class _Searches:
         Raises:
             ResultError: the program ends.
         """
+        found = self.begin(key, search)
+        while not wait([found], _LOOK_S).done:
+            if not threading.main_thread().is_alive():
+                raise ResultError("The program has ended.")
+        result: T = found.result()
+        return result
+
+    def begin(self, key: Hashable, search: Callable[[], T]) -> Future[T]:
+        """Begin a search whose result will be needed, unless it is known or being made."""
         with self._lock:
-            found = self._known.pop(key, None)
+            found: Future[T] | None = self._known.pop(key, None)
             if found is None or (found.done() and found.exception() is not None):
                 found = Future()
                 threading.Thread(target=self._run, args=(found, search), daemon=True).start()
             self._known[key] = found
             while len(self._known) > _MOST_SEARCHES:
                 self._known.pop(next(iter(self._known)))
-        while not wait([found], _LOOK_S).done:
-            if not threading.main_thread().is_alive():
-                raise ResultError("The program has ended.")
-        result: T = found.result()
-        return result
+        return found
 
     @staticmethod
     def _run(found: Future[T], search: Callable[[], T]) -> None:
@@ -200,18 +205,18 @@ class _Searches:
 _SEARCHES = _Searches()
 
 
-def _dots(path: Path, stamp: tuple[int, int], number: int) -> tuple[Points, DotProfile]:
+def _find_dots(path: Path, stamp: tuple[int, int], number: int) -> tuple[Points, DotProfile]:
     """All dots of a frame, as `haselab track --auto` finds them, and the profile of particles."""
+    frame = _frame(path, stamp, number)[0]
+    profile = find_profile(frame)
+    try:
+        return find_points(frame, _ALL_DOTS, None, profile), profile
+    except ResultError:
+        return Points([], np.zeros((0, 2)), 0), profile
 
-    def search() -> tuple[Points, DotProfile]:
-        frame = _frame(path, stamp, number)[0]
-        profile = find_profile(frame)
-        try:
-            return find_points(frame, _ALL_DOTS, None, profile), profile
-        except ResultError:
-            return Points([], np.zeros((0, 2)), 0), profile
 
-    return _SEARCHES.result((path, stamp, number), search)
+def _dots(path: Path, stamp: tuple[int, int], number: int) -> tuple[Points, DotProfile]:
+    return _SEARCHES.result((path, stamp, number), lambda: _find_dots(path, stamp, number))
 
 
 def _large_dot(
@@ -255,6 +260,8 @@ def _picture(videos: Videos, values: JsonObject) -> JsonObject:
     """A frame as a picture."""
     name, path, stamp, number = _of(videos, values)
     frame, count, time_s = _frame(path, stamp, number)
+    if videos.only is not None and number == 0:  # where its points are picked, soon
+        _SEARCHES.begin((path, stamp, number), lambda: _find_dots(path, stamp, number))
     low, high = grey_range(frame)
     grey = np.clip((frame - low) * (255.0 / (high - low)), 0, 255).astype(np.uint8)
     buffer = io.BytesIO()

@@ -8,6 +8,7 @@
   const ANSWER_MS = 3000; // the stop process waits 2 s for the bench process
   let pressed = false;
   let pressedAt = -Infinity;
+  let socket = null; // the browser sends its messages sooner than a request
 
   const show = (text, bad) => {
     if (state.textContent !== text) state.textContent = text;
@@ -21,11 +22,15 @@
 
   async function ready() {
     if (!await answers()) show("STOP DOES NOT ANSWER. Press the emergency stop of the bench.", true);
-    else if (!pressed) show("STOP: ready", false);
+    else {
+      if (socket === null || socket.readyState > WebSocket.OPEN) socket = new WebSocket(`${address.replace("http", "ws")}/socket`);
+      if (!pressed) show("STOP: ready", false);
+    }
     setTimeout(ready, 2000);
   }
 
   async function stop() {
+    if (socket !== null && socket.readyState === WebSocket.OPEN) socket.send("stop");
     pressed = true;
     pressedAt = performance.now();
     button.classList.add("pressed");

@@ -3,6 +3,7 @@ import { Requests } from "/static/requests.js";
 
 const SCHEMA = 1;
 const SILENT_MS = 900; // without a frame the connection is opened again
+const SLOW_MS = 50; // a page that takes longer for a draw acknowledges frames later
 const PATIENCE_MS = 20000; // longest wait for a connection: Chromium delays new ones after failures
 
 export class Link extends Requests {
@@ -16,6 +17,7 @@ export class Link extends Requests {
     this.framedAt = -Infinity;
     this.blockAge = 0; // when the last frame was sent, in s
     this.clock = 0; // of the bench process in the last frame, in s; the process refuses commands with an old time
+    this.ackDelay = 0; // of a slow page, which then gets fewer frames, in ms
     this.patience = SILENT_MS; // with a socket that is connecting
     this.waiting = new Map();
     this.number = 0;
@@ -43,7 +45,7 @@ export class Link extends Requests {
     socket.onmessage = ({ data }) => {
       if (socket !== this.socket) return; // an old connection: its frames are old
       if (typeof data === "string") this.heard(JSON.parse(data));
-      else this.framed(data);
+      else this.framed(data, socket);
     };
     socket.onclose = ({ code, reason }) => {
       if (socket !== this.socket) return;
@@ -85,7 +87,7 @@ export class Link extends Requests {
     if (answer) answer(message);
   }
 
-  framed(buffer) {
+  framed(buffer, socket) {
     const head = new DataView(buffer);
     if (head.getUint16(0, true) !== SCHEMA) { location.reload(); return; }
     const number = head.getUint32(4, true);
@@ -109,7 +111,8 @@ export class Link extends Requests {
     this.patience = SILENT_MS;
     this.blockAge = about.age_s;
     this.clock = about.clock_s;
-    this.send({ ack: number });
+    if (this.ackDelay < SLOW_MS) this.send({ ack: number });
+    else setTimeout(() => { if (socket === this.socket) this.send({ ack: number }); }, this.ackDelay);
     this.onFrame({ ...about, monitors, signals });
   }
 

@@ -10,10 +10,12 @@ import numpy as np
 
 from haselab.base import InputError
 from haselab.control import LoopSetting
+from haselab.identify.nonlinear.input_curve import InputCurve
 from haselab.models.actuator import ActuatorTables
 from haselab.models.actuator.model_tables import (
     CovarianceTable,
     LoopTable,
+    NonlinearTable,
     OriginTable,
     PlantTable,
     PolesTable,
@@ -34,6 +36,7 @@ __all__ = [
     "MAT_NAME",
     "loop_of",
     "read_any_plant",
+    "read_input_curve",
     "read_loop",
     "read_model",
     "read_origin",
@@ -218,6 +221,27 @@ def read_origin(path: Path) -> OriginTable:
         return OriginTable()
     data = _data(path)
     return validated(OriginTable, {**data, **data.get("plant", {})}, path)
+
+
+def read_input_curve(path: Path) -> InputCurve | None:
+    """Read the curve ahead of a Hammerstein model; None for a linear model.
+
+    Raises:
+        InputError: the model is nonlinear in another way, or an impossible value.
+    """
+    data = {} if path.suffix.lower() == ".mat" else _data(path)
+    if "nonlinear" not in data:
+        return None
+    table = validated(NonlinearTable, {**data["nonlinear"], "gain": data["gain"]}, path)
+    if not table.kind.startswith("hammerstein"):
+        raise InputError(
+            f"The model is nonlinear ({table.kind}), and a file has only its linear part. Compare "
+            f"it in Python with the method compare of the fit, or fit a linear model. {path}"
+        )
+    if table.gain == 0.0:
+        raise InputError(f"gain is 0, but a model needs another one. {path}")
+    factors = (1.0, table.gain_2 / table.gain, table.gain_3 / table.gain)
+    return InputCurve(table.operating_input, factors)
 
 
 def loop_of(

@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+import os
 from collections.abc import Iterable, Iterator
 from dataclasses import dataclass
+from itertools import chain
 from typing import Literal, TypeVar
 
 import numpy as np
@@ -13,6 +15,7 @@ from scipy.fft import dctn, idct
 from scipy.ndimage import gaussian_laplace, map_coordinates
 from scipy.spatial import cKDTree
 
+from haselab.actuators.threads import in_threads
 from haselab.base import InputError, ResultError
 from haselab.tracking.options import Floats
 
@@ -35,6 +38,7 @@ _PARTICLE_SIGMAS_PX = (1.0, 1.4, 2.0, 2.8, 4.0, 5.6)
 _STRONGEST = 50  # strongest dots, used to choose the scale
 _NOISE_FACTOR = 6.0
 _AT_ONCE = 4096  # points compared at once, to limit memory
+_WORKERS = os.cpu_count() or 1
 _ROUNDING = 12.0**-0.5
 _FAINTEST = 0.25  # of the strong dots' median response: faintest dot
 _LEAST_ROUND = 0.5  # ratio of the two curvatures of a dot at its own scale
@@ -89,12 +93,15 @@ def _peaks(
         highest = response[y, x] >= response[y + down, x + right]
         y, x = y[highest], x[highest]
     found: NDArray[np.intp] = np.stack([y, x], axis=1)
+    if not len(found):
+        return found
     radius = max(1, round(radius_px))
-    around = sliding_window_view(
-        np.pad(response, radius, constant_values=-np.inf), (2 * radius + 1,) * 2
-    )
+    beyond = max(0, radius - edge)  # of the windows; padding a large image takes long
+    padded = np.pad(response, beyond, constant_values=-np.inf) if beyond else response
+    around = sliding_window_view(padded, (2 * radius + 1,) * 2)
+    low = beyond - radius
     largest = [
-        around[part[:, 0], part[:, 1]].max(axis=(1, 2))
+        around[part[:, 0] + low, part[:, 1] + low].max(axis=(1, 2))
         for part in np.split(found, range(_AT_ONCE, len(found), _AT_ONCE))
     ]
     found = found[response[found[:, 0], found[:, 1]] == np.concatenate(largest)]
@@ -162,17 +169,20 @@ def find_profile(image: NDArray[np.generic], polarity: Polarity | None = None) -
     grey = _check_image(image, polarity or "dark")
     noise = _pixel_noise(grey)
     signs: tuple[Polarity, ...] = ("dark", "bright") if polarity is None else (polarity,)
-    scores = {}
-    for sigma in _PARTICLE_SIGMAS_PX:
-        dark = _response(grey, sigma, "dark")
+
+    def scores(sigma: float) -> list[tuple[float, DotProfile]]:
+        dark, found = _response(grey, sigma, "dark"), []
         for sign in signs:
             response = dark if sign == "dark" else -dark
             peaks = _peaks(response, sigma, noise, sigma, round(3 * sigma))[:_STRONGEST]
             compact = _paraboloids(response, peaks)[2] > _LEAST_COMPACT
             strength = response[peaks[:, 0], peaks[:, 1]][compact]
             # squares: the faint ring around each dot has a response of opposite sign
-            scores[DotProfile(sigma, sign)] = float(np.sum(strength**2))
-    return max(scores, key=lambda profile: scores[profile])
+            found.append((float(np.sum(strength**2)), DotProfile(sigma, sign)))
+        return found
+
+    scored = chain.from_iterable(in_threads(scores, _PARTICLE_SIGMAS_PX, _WORKERS))
+    return max(scored, key=lambda each: each[0])[1]
 
 
 @dataclass(frozen=True)
@@ -343,14 +353,16 @@ def _scale_space(image: Floats, polarity: str) -> Iterator[tuple[float, Floats]]
     sign = 1.0 if polarity == "dark" else -1.0
     # In the cosine transform (mirrored edges) every scale costs the same.
     down, across = ((np.pi * np.arange(size) / size) ** 2 for size in image.shape)
-    content = dctn(image, norm="ortho") * -(down[:, None] + across) * sign
+    content = dctn(image, norm="ortho", workers=_WORKERS) * -(down[:, None] + across) * sign
 
     for sigma in 2.0 * 2.0 ** (np.arange(steps) / 4.0):
         half = 0.5 * sigma**2
         rows, columns = (int(np.sum(half * each < _NO_CONTENT)) for each in (down, across))
         smooth = sigma**2 * np.exp(-half * down[:rows])[:, None] * np.exp(-half * across[:columns])
-        lines = idct(content[:rows, :columns] * smooth, n=image.shape[1], axis=1, norm="ortho")
-        yield float(sigma), np.asarray(idct(lines, n=image.shape[0], axis=0, norm="ortho"))
+        lines = idct(content[:rows, :columns] * smooth, n=image.shape[1], axis=1, norm="ortho",
+                     workers=_WORKERS)  # fmt: skip
+        response = idct(lines, n=image.shape[0], axis=0, norm="ortho", workers=_WORKERS)
+        yield float(sigma), np.asarray(response)
 
 
 def _with_neighbours(levels: Iterable[T]) -> Iterator[tuple[T | None, T, T | None]]:

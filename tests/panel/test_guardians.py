@@ -66,7 +66,7 @@ def children_of_stop(panel: RunningPanel) -> str:
     return subprocess.run(words, capture_output=True, text=True).stdout
 
 
-async def refusals(page: Page) -> int:
+async def count_refusals(page: Page) -> int:
     """How often arming is refused until the `haselab rig safe` of STOP has ended."""
     count = 0
     async with asyncio.timeout(WAIT_S):
@@ -105,7 +105,7 @@ def test_a_bench_can_be_armed_again_after_stop_has_reset_its_board(
                     await asyncio.to_thread(panel.stop)
                     await page.until(lambda state: state["stage"] == "tripped")
                     is_stopped = True
-                    await refusals(page)
+                    await count_refusals(page)
                     assert "answer" in await page.ask("cancel")
                     shown_s = page.end_s
                     async with asyncio.timeout(WAIT_S):
@@ -114,8 +114,8 @@ def test_a_bench_can_be_armed_again_after_stop_has_reset_its_board(
                     assert page.state["stage"] == "tripped" and page.state["mode"] == "idle"
                     reason = page.state["reason"]
                     # `rig safe` may be first, or reset the board while its output is read back.
-                    whys = ("STOP was pressed", "made the bench safe", "reserved by a program")
-                    assert any(why in reason for why in whys), reason
+                    causes = ("STOP was pressed", "made the bench safe", "reserved by a program")
+                    assert any(cause in reason for cause in causes), reason
                     assert abs(served.hub.output_v) < 50.0
                     assert "error" in await page.ask("drive", value_v=1.0)
                     asked = await page.ask("request")
@@ -135,7 +135,7 @@ def test_a_bench_can_be_armed_again_after_stop_has_reset_its_board(
 
 
 def test_a_bench_armed_as_soon_as_possible_after_stop_stays_armed(tmp_path: Path) -> None:
-    """Until the `rig safe` of this STOP has ended, which would trip the bench, it is refused."""
+    """Arming is refused until `rig safe`, which would trip the bench, has ended."""
     rig = tmp_path / "served.toml"
     with ServedTwin(twin_of_reading("hz"), 1, PACE) as served:
         rig.write_text(served.rig_file(ahead_blocks=5) + PATIENT)
@@ -146,7 +146,7 @@ def test_a_bench_armed_as_soon_as_possible_after_stop_stays_armed(tmp_path: Path
                 assert "answer" in await page.arm(1.5)
                 await asyncio.to_thread(panel.stop)
                 await page.until(lambda state: state["stage"] == "tripped")
-                assert await refusals(page) > 0
+                assert await count_refusals(page) > 0
                 assert "rig safe" not in await asyncio.to_thread(children_of_stop, panel)
                 assert "answer" in await page.arm(1.5)
                 await page.ask("drive", value_v=0.2)
@@ -173,7 +173,7 @@ skipped_cycles = 1
 frame_rate_hz = 200.0
 """
 PACE = 0.2  # of the wall clock, so that a busy machine queues its outputs in time
-# By the clock of the wall, which a busy machine does not keep up with.
+# These limits count wall-clock time, and a busy machine is late.
 PATIENT = "\n[safety]\nlease_s = 10.0\nmissed_limit = 1000\nlate_limit = 1000\n"
 
 
@@ -233,7 +233,7 @@ def test_new_guardians_watch_after_the_first_ones_have_acted(tmp_path: Path) -> 
                 assert found["commanded"] is False
                 os.kill(bench, signal.SIGCONT)
                 await page.until(lambda state: state["stage"] == "tripped")
-                await refusals(page)
+                await count_refusals(page)
                 assert "answer" in await page.arm(1.5)
 
         try:

@@ -79,8 +79,8 @@ class LiveBench:
         prepare: prepares the study that a page has chosen; None: no study can be played.
         player: plays it.
         lease_s: longest time without a message from the page that armed the bench, in s.
-        rig_safe_runs: whether the `haselab rig safe` that STOP has started still runs. Until it
-            has ended, it would end the next run.
+        rig_safe_runs: whether the `haselab rig safe` that STOP has started still runs. Meanwhile
+            arming is refused, because it would trip the bench.
     """
 
     def __init__(
@@ -419,8 +419,8 @@ class LiveBench:
             raise SafetyError("The bench is armed already. Disarm it first.")
         if self._rig_safe_runs():
             raise SafetyError(
-                "STOP is still switching the instruments off ('haselab rig safe'). Try again in a "
-                "few seconds."
+                "'haselab rig safe', which STOP has started, is still switching the instruments "
+                "off. Try again in a few seconds."
             )
 
     def _require_armed(self, holder: str) -> None:

@@ -6,8 +6,8 @@ that no haselab program can energise the bench, and then makes the bench process
 (`stop.sock` in FOLDER). On a real bench it also starts `haselab rig safe RIG.toml`, which uses
 connections of its own; and if the bench process does not answer, it ends the lease in the
 interlock, so that the guardians act at once. STOP needs no token; pages of other origins are
-refused. `GET /ready` keeps the connection of a page open. A message on the WebSocket `/socket` does
-the same as `POST /stop`, and a browser sends it sooner than a request; the page does both.
+refused. `GET /ready` keeps the connection of a page open. A text message on the WebSocket
+`/socket` does the same as `POST /stop`, and leaves a browser sooner; the page sends both.
 
 This module uses only the standard library and the interlock, so it starts quickly.
 """
@@ -42,7 +42,7 @@ _ANSWER_S = 2.0  # longest wait for the bench process
 _PROMPT_S = 0.5  # after which the guardians are called
 _TRIALS = 20  # to find a port that is free on all addresses
 _SOCKET_ID = b"258EAFA5-E914-47DA-95CA-C5AB0DC85B11"  # RFC 6455, section 1.3
-_TEXT, _MOST_BYTES = 1, 125  # of a WebSocket frame: its kind; longest payload with a short head
+_TEXT, _MOST_BYTES = 1, 125  # of a WebSocket frame: opcode; longest payload after 2 bytes
 _MOST_CONNECTIONS = 128  # at the same time; more than the pages need
 
 
@@ -129,7 +129,7 @@ class _Handler(BaseHTTPRequestHandler):
             self.rfile.read(min(int(size), 4096) if size.isdecimal() else 0)
 
     def _serve_socket(self, key: str) -> None:
-        """Stop for each text frame; source: RFC 6455, sections 4.2.2 and 5.2."""
+        """Call STOP for each text frame. Source: RFC 6455, sections 4.2.2 and 5.2."""
         accepted = hashlib.sha1(key.encode() + _SOCKET_ID, usedforsecurity=False).digest()
         self.send_response(101)
         self.send_header("Upgrade", "websocket")
@@ -139,7 +139,7 @@ class _Handler(BaseHTTPRequestHandler):
         self.close_connection = True
         self.connection.settimeout(None)
         while len(head := self.rfile.read(2)) == 2 and head[1] & 0x7F <= _MOST_BYTES:
-            self.rfile.read(4 + (head[1] & 0x7F))  # mask and payload have no meaning
+            self.rfile.read(4 + (head[1] & 0x7F))  # mask and payload are ignored
             if head[0] & 0x0F != _TEXT:
                 return
             self.server.stop()
@@ -181,15 +181,15 @@ class _Stop:
         begun_s = time.perf_counter()
         self._interlock.revoke(_REASON)
         revoked_s = time.perf_counter() - begun_s
-        starting = threading.Thread(target=self._rig_safe, daemon=True)
-        starting.start()
+        thread = threading.Thread(target=self._rig_safe, daemon=True)
+        thread.start()
         answer = self._tell_bench(_PROMPT_S)
         if answer != COMMANDED:
             self._interlock.lease(0.0)  # a guardian looks every 20 ms
         if not answer:
             answer = self._tell_bench(_ANSWER_S - _PROMPT_S)
         commanded_s = time.perf_counter() - begun_s
-        starting.join(_PROMPT_S)  # so that nobody can arm the bench before it runs
+        thread.join(_PROMPT_S)  # after this answer, `rig_safe_runs` is true
         return {"revoked_ms": 1e3 * revoked_s, "commanded": answer == COMMANDED,
                 "fault": "" if answer == COMMANDED else answer.decode(errors="replace"),
                 "commanded_ms": 1e3 * commanded_s}  # fmt: skip
@@ -216,7 +216,7 @@ class _Stop:
                 command = [sys.executable, "-m", "haselab.cli", "rig", "safe", self._rig]
                 with contextlib.ExitStack() as opened:
                     locks: list[int] = []
-                    with contextlib.suppress(OSError):  # a full disk must not prevent it
+                    with contextlib.suppress(OSError):  # a full disk must not prevent `rig safe`
                         lock = opened.enter_context((self._folder / _RIG_SAFE).open("wb"))
                         fcntl.flock(lock, fcntl.LOCK_SH)
                         locks.append(lock.fileno())

@@ -57,8 +57,8 @@ _MOST_BYTES = 4096  # of a message of a page
 _MOST_COLUMNS = 4000
 _COLUMN_STEP = 100  # so that windows of almost the same width share their frames
 _BENCH_S = 10.0  # longest wait for an answer of the bench process
-_ARM_S = 30.0  # the same for `_SLOW`; see `page_leases`
-_SLOW = ("request", "arm")  # new guardians are started; a study is checked
+_ARM_S = 30.0  # the same for `_SLOW_COMMANDS`; see `page_leases`
+_SLOW_COMMANDS = ("request", "arm")  # start new guardians; check a study
 _HEAD = struct.Struct("<HHIddddII")
 
 
@@ -160,7 +160,7 @@ class _Bench:
                 "bench is at 0 V, then start the panel again."
             }
         self._number += 1
-        number, wait_s = self._number, _ARM_S if what in _SLOW else _BENCH_S
+        number, wait_s = self._number, _ARM_S if what in _SLOW_COMMANDS else _BENCH_S
         answer = self._waiting[number] = asyncio.get_running_loop().create_future()
         command = {"id": number, "do": what, "holder": holder, "values": values, "at_s": at_s}
         self._writer.write(json.dumps(command).encode() + b"\n")

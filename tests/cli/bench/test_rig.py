@@ -265,6 +265,17 @@ def test_what_only_a_twin_can_do_refuses_a_bench(rig: Path, capsys) -> None:
     assert code == 2 and "kind = 'bench', but this command needs kind = 'twin'" in err
 
 
+def test_a_bench_whose_program_was_killed_is_not_called_armed_by_it(
+    capsys, tmp_path, monkeypatch
+) -> None:
+    monkeypatch.setenv("HASELAB_INTERLOCKS", str(tmp_path / "locks"))
+    code = "from haselab.safety.interlock import Interlock; import os\n"
+    code += "lock = Interlock('NI 01A2'); lock.own('a test'); lock.set_live(True); os._exit(0)"
+    subprocess.run([sys.executable, "-c", code], check=True)
+    printed = call(capsys, "rig", "status")[1]
+    assert "NOT CONFIRMED AT 0 V. Its last program ended while the bench was armed" in printed
+
+
 def test_the_status_names_armed_benches_and_why_others_were_made_safe(
     capsys, tmp_path, monkeypatch
 ) -> None:
@@ -278,6 +289,10 @@ def test_the_status_names_armed_benches_and_why_others_were_made_safe(
         code, printed, _ = call(capsys, "rig", "status")
         assert code == 0
         assert f"NI_01A2  ARMED by process {os.getpid()}" in printed
+        Interlock("a later bench").close()
+        rows = call(capsys, "rig", "status")[1].splitlines()
+        assert [row.split("  ")[0] for row in rows] == ["NI_01A2", "a_later_bench"]
+        (tmp_path / "locks" / "a_later_bench.state").unlink()
         gate.interlock.set_live(False)
         gate.interlock.revoke("The strain is stuck.")
         (bench,) = json.loads(call(capsys, "rig", "status", "--json")[1])["benches"]

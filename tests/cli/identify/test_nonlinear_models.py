@@ -49,7 +49,7 @@ def test_compare_applies_the_curve_of_the_model_file(tmp_path, kind, curve):
     result = invoke("compare", model, new, "--hold", "zero", "--json")
     assert result.exit_code == 0, result.output
     found = json.loads(result.stdout)
-    # The error is the noise, but for the uncertainty of 7 of 3000 parameters.
+    # The error is the noise, and that of 7 parameters from 3000 samples.
     assert found["rms_error"] == pytest.approx(NOISE, rel=4.0 / np.sqrt(2.0 * 3000) + 7 / 3000)
     assert found["inside_band"] is None and found["status"] == "ok"
     fit = fit_nonlinear(hl.records(first, hold="zero"), TransferStructure(), kind)
@@ -58,7 +58,7 @@ def test_compare_applies_the_curve_of_the_model_file(tmp_path, kind, curve):
 
 
 def test_compare_from_rest_agrees_too(tmp_path):
-    """A curve has no effect on the output at the input 0."""
+    """The curve is 0 at the input 0, so the output starts at 0."""
     first, new = (record(tmp_path / f"{k}.csv", k, np.square) for k in (1, 2))
     model = tmp_path / "model.json"
     invoke("identify", "transfer", first, "--nonlinear", "hammerstein-2", "--out", model)
@@ -67,13 +67,39 @@ def test_compare_from_rest_agrees_too(tmp_path):
     assert json.loads(result.stdout)["rms_error"] < 1.1 * NOISE
 
 
-def test_a_model_whose_curve_no_file_has_is_not_compared(tmp_path):
+def test_compare_refuses_a_wiener_model(tmp_path):
     path = record(tmp_path / "r.csv", 1, lambda u: u)
     model = tmp_path / "model.json"
     invoke("identify", "transfer", path, "--nonlinear", "wiener", "--out", model)
     new = record(tmp_path / "new.csv", 2, lambda u: u)
-    with pytest.raises(InputError, match=r"\(wiener\), and a file has only its linear part"):
+    with pytest.raises(InputError, match=r"\(wiener\), but of the nonlinear models"):
         invoke("compare", model, new)
+
+
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        ({"nonlinear": 5}, "nonlinear is 5, but must be an object"),
+        ({"nonlinear": {"kind": "hammerstein-2"}}, "operating_input"),
+        ({"gain": 0.0}, "gain is 0, but a Hammerstein model"),
+    ],
+)
+def test_a_damaged_nonlinear_model_is_refused(tmp_path, change, message):
+    path, model = record(tmp_path / "r.csv", 1, np.square), tmp_path / "model.json"
+    invoke("identify", "transfer", path, "--nonlinear", "hammerstein-2", "--out", model)
+    damaged = json.loads(model.read_text())
+    del damaged["covariance"]
+    model.write_text(json.dumps({**damaged, **change}))
+    with pytest.raises(InputError, match=message):
+        invoke("compare", model, record(tmp_path / "new.csv", 2, np.square))
+
+
+def test_a_nonlinear_part_of_null_is_none(tmp_path):
+    path, model = record(tmp_path / "r.csv", 1, lambda u: u), tmp_path / "model.json"
+    invoke("identify", "transfer", path, "--out", model)
+    model.write_text(json.dumps({**json.loads(model.read_text()), "nonlinear": None}))
+    new = record(tmp_path / "new.csv", 2, lambda u: u)
+    assert invoke("compare", model, new, "--hold", "zero").exit_code == 0
 
 
 def test_a_nonlinear_model_is_refused_for_an_actuator_file(tmp_path):
@@ -100,4 +126,4 @@ def test_a_record_that_begins_with_its_first_step_says_so(before_s):
     kept = time_s >= 5.0 - before_s
     found = hl.Record(u[kept], rate_hz, y[kept], time_s[kept] - time_s[kept][0])
     fit = hl.fit_transfer(found, TransferStructure(slow_modes=1))
-    assert any("began to move before the record" in note for note in fit.notes) == (not before_s)
+    assert any("before the input first changes" in note for note in fit.notes) == (not before_s)

@@ -488,12 +488,13 @@ def _safe_by_its_program(key: str, what: str = "program") -> tuple[str, str]:
 def status(as_json: bool, out: Path | None) -> None:
     """Show which benches of this computer are armed.
 
-    For the others it shows why they were made safe. The bench whose state changed last is first. It
-    reads what programs have recorded since the computer started. It does not contact any
-    instrument: this is NOT a measurement of a voltage.
+    For the others it shows why they were made safe. Armed benches are first, then those
+    that were used last. It reads what programs have recorded since the computer started. It does
+    not contact any instrument: this is NOT a measurement of a voltage.
     """
     places = sorted(interlock_folder().glob("*.state"), key=_changed_s, reverse=True)
     benches = [_state_of(place.stem) for place in places]
+    benches.sort(key=lambda bench: not bench["armed"])
     text = json.dumps({"benches": benches}, indent=2)
     if out is not None:
         write_text(out, text + "\n")
@@ -518,7 +519,8 @@ def _changed_s(place: Path) -> float:
 def _state_of(key: str) -> dict[str, object]:
     """The state of a bench's interlock, as text and for JSON."""
     with contextlib.closing(Interlock(key)) as interlock:
-        live, pid, reason = interlock.live, interlock.owner_pid, interlock.reason
+        live, reason = interlock.live, interlock.reason
+        pid = interlock.owner_pid if interlock.in_use else 0  # it may have been killed
     if live and pid:
         state = f"ARMED by process {pid}. The output may be energised"
     elif live:

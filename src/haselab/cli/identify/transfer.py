@@ -151,7 +151,7 @@ def transfer(
         if options["nonlinear"]:
             raise InputError(
                 f"--nonlinear {options['nonlinear']} excludes --actuator: [model] of an actuator "
-                "file is linear. Leave out one of them, or write the model with --out."
+                "file is linear. Leave out --nonlinear, or write --out FILE in place of --actuator."
             )
         load_actuator(actuator, to_write=True)  # before a long fit
     records: list[Record] = []
@@ -221,7 +221,7 @@ def _save(
     """Write [model] of the actuator file."""
     if isinstance(fit, NonlinearFit):
         raise InputError(
-            f"[model] was not changed: it needs a linear model, but --choose found {fit.kind}. "
+            f"[model] was not changed: it needs a linear model, but --choose selected {fit.kind}. "
             f"Leave out --choose nonlinear (or all), or write the model with --out. {actuator}"
         )
     section = model_section(fit, names, units)

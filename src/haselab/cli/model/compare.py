@@ -51,7 +51,7 @@ from haselab.store.columns.selection import ColumnOptions
 __all__ = ["command"]
 
 _NO_BAND = "no uncertainty: the model has no covariance"
-_NO_CURVE = "no uncertainty: the model file states none for the nonlinear curve"
+_NO_CURVE = "no uncertainty: the model file has no covariance of the nonlinear curve"
 _NO_NOISE = (
     "none: the model file does not state residual_std, without which the band would be too narrow. "
     "Identify the model again"
@@ -140,16 +140,17 @@ def command(
     exit code is 3 if the error is larger than the band explains, or if the model was identified
     from one of the files.
 
-    With a model of 'identify transfer' or 'identify arx', FILES are tables. The curve of a
-    Hammerstein model is applied to the input, and there is no band. The command reports the fit in
-    percent, the rms error and the share of samples inside the 95 % band. It first estimates the
-    initial state and the offset of each record, unless --at-rest is given. Samples that were used
-    for the fit are recognised by their values, also in a part of a record, in another format and
-    with fewer digits. Their share is used_for_fit; it is null if the steps of the converter hide
-    whether the record is a copy or a repetition. The exit code is 3 if this share is above 5 %, if
-    the prediction is worse than the mean of the record, if its rms error without white noise is
-    more than twice the standard deviation that the band states (3.5 times if the band is the
-    uncertainty of the parameters alone), or if the record is explained as well without its input.
+    With any other model, such as that of 'identify transfer' or 'identify arx', FILES are tables.
+    The command reports the fit in percent, the rms error and the share of samples inside the 95 %
+    band. For a Hammerstein model it first applies the curve to the input, and reports no band;
+    other nonlinear models are refused. It estimates the initial state and the offset of each
+    record, unless --at-rest is given. Samples that were used for the fit are recognised by their
+    values, also in a part of a record, in another format and with fewer digits. Their share is
+    used_for_fit; it is null if the steps of the converter hide whether the record is a copy or a
+    repetition. The exit code is 3 if this share is above 5 %, if the prediction is worse than the
+    mean of the record, if its rms error without white noise is more than twice the standard
+    deviation that the band states (3.5 times if the band is the uncertainty of the parameters
+    alone), or if the record is explained as well without its input.
     """
     linear = at_rest or through_voltage_map or held_at_hz is not None
     linear |= hold is not None
@@ -188,7 +189,7 @@ def command(
                 to_strain=origin.output_unit != "m",
             )  # fmt: skip
             _check_units(origin, found.units, (source, output), through_voltage_map)
-            records += found.records if curve is None else map(curve.applied, found.records)
+            records += found.records if curve is None else map(curve.apply_to, found.records)
             measured_name = output_name(output, found.units[1], through_voltage_map)
             axes = axis_names(source, measured_name, found.units)
     with name_files_in_errors(*files):

@@ -16,17 +16,17 @@ Floats = NDArray[np.float64]
 
 @dataclass(frozen=True)
 class InputCurve:
-    r"""Input of the linear part: $d + b_2 d^2 + b_3 d^3$ with $d = u - u_0$.
+    r"""Input of the linear part of a Hammerstein model: $d + b_2 d^2 + b_3 d^3$ with $d = u - u_0$.
 
-    A constant is subtracted, so that it is 0 for the input 0.
+    A constant is subtracted, so that the curve is 0 at the input 0.
 
     Args:
-        middle: u0, in the unit of the input.
-        factors: of $d, d^2, \dots$. Shape `(D,)`.
+        operating_input: u0, in the unit of the input.
+        coefficients: of $d, d^2, \dots$. Shape `(D,)`.
     """
 
-    middle: float
-    factors: tuple[float, ...]
+    operating_input: float
+    coefficients: tuple[float, ...]
 
     def at(self, u: ArrayLike) -> Floats:
         """Values of the curve. Shape of `u`.
@@ -35,14 +35,17 @@ class InputCurve:
             >>> InputCurve(1.0, (1.0, 0.5)).at([0.0, 1.0, 2.0])
             array([0. , 0.5, 2. ])
         """
-        powers = np.polynomial.Polynomial((0.0, *self.factors))
-        return np.asarray(powers(np.asarray(u, dtype=float) - self.middle) - powers(-self.middle))
+        powers = np.polynomial.Polynomial((0.0, *self.coefficients))
+        return np.asarray(
+            powers(np.asarray(u, dtype=float) - self.operating_input)
+            - powers(-self.operating_input)
+        )
 
-    def applied(self, record: Record) -> Record:
+    def apply_to(self, record: Record) -> Record:
         """The record with the curve's values as its input.
 
         Raises:
-            InputError: the curve has the same value for all of its inputs.
+            InputError: the curve has the same value for all inputs of the record.
         """
         before = record.input_before
         before = None if before is None else float(self.at(before))

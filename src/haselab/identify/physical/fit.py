@@ -50,7 +50,8 @@ _EXPLAINS = 0.1  # of a model error, which an effect must explain to be added
 _ROUNDS = 3  # of the noise's estimate
 _SAME_NOISE = 0.02
 _USUAL_INERTIA = 0.05  # clamp and linkage over the hung mass
-_LARGE_INERTIAS = (1.0, 4.0)  # with which a search begins again if the records contradict the model
+# Added inertia over the hung mass: further starts, if the records contradict the model.
+_LARGE_INERTIAS = (1.0, 4.0)
 _APART = 2.0  # rms over noise from which records are compared alone
 _FEW_STEPS = 8  # from what explains one record to what explains all, if that exists
 _MOVED = 4.0  # standard deviations of the zero; above, the lengths of a record count as shifted
@@ -94,16 +95,16 @@ def fit_actuator(
         return ActuatorFit(status=fault, kind=law.kind)
     known = {CAMERA_OFFSET: camera_bias_m, CAMERA_SCALE: camera_scale_std}
 
-    def fitted(inertia_kg: float) -> ActuatorFit:
+    def fit_from(inertia_kg: float) -> ActuatorFit:
         start = Unknowns.of(law, added_inertia_kg=inertia_kg, mass_kg=mass_kg)
         return _fit(law, records, start, known, clock_std)
 
     if added_inertia_kg is not None:
-        fit = fitted(added_inertia_kg)
+        fit = fit_from(added_inertia_kg)
     else:
-        fit = fitted(_USUAL_INERTIA * mass_kg)
+        fit = fit_from(_USUAL_INERTIA * mass_kg)
         if fit.status.startswith(CONTRADICTED):
-            others = (fitted(share * mass_kg) for share in _LARGE_INERTIAS)
+            others = (fit_from(share * mass_kg) for share in _LARGE_INERTIAS)
             fit = next((other for other in others if other.status == "ok"), fit)
     if not fit.succeeded:
         for remark in (remark for record in records for remark in record.repeated_remarks):

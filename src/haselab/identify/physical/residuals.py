@@ -30,7 +30,7 @@ __all__ = [
 ]
 
 Floats = NDArray[np.float64]
-CONTRADICTED = "the records contradict the model"  # how such a status begins
+CONTRADICTED = "the records contradict the model"  # first words of the status
 _SLIGHT, _GROSS = 1.05, 10.0  # rms over noise: of a model error, and of a contradiction
 _SCALE = 0.2  # largest error of the capacitance that a calibration can have
 _LEAST_SHARE = 0.75  # of the variance of each channel that a model must explain

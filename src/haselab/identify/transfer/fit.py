@@ -71,11 +71,13 @@ _FED_BACK = (
     "is not white biases the gain and the delay, and the intervals do not include this bias. "
     "Record in open loop, or use a larger reference signal."
 )
-_MOVED, _LEAST_HELD = 0.1, 20  # share of the output's range; outputs during the first level
-_MOVING = (
-    "The output changes by {:.0f} % of its range while the input still has its first level, so it "
-    "began to move before the record. The state before the record is estimated, so this motion "
-    "hardly determines the slow modes. Record some seconds at another level before the first step."
+_EARLY = 0.1  # share of the output's range
+_LEAST_EARLY = 20  # outputs before the input first changes
+_EARLY_CHANGE = (
+    "The output changes by {:.0f} % of its range before the input first changes: the plant was not "
+    "at rest at the start, or the sensor drifts. The initial state is estimated, so this change "
+    "hardly determines the slow modes. Begin the record with some seconds at another, settled "
+    "level, or remove the drift."
 )
 _RESTING = (
     "A step at t = 0 is indistinguishable from an initial state; rest before it is assumed. "
@@ -560,20 +562,20 @@ def _notes(structure: TransferStructure, best: Best, estimates: dict[str, Estima
         notes.append(f"The delay is {shown}; the plant uses 0 s.")
     if structure.zeros == structure.poles and structure.delay == "auto":
         notes.append("With as many zeros as poles the delay is assumed to be 0 s.")
-    moved = max(map(_moved_at_first_level, best.records))
-    if structure.slow_modes and structure.initial_state and moved > _MOVED:
-        notes.append(_MOVING.format(100.0 * moved))
+    early = max(map(_early_change, best.records))
+    if structure.slow_modes and structure.initial_state and early > _EARLY:
+        notes.append(_EARLY_CHANGE.format(100.0 * early))
     if best.whiteness_p < 0.05:
         notes.append(_NOT_WHITE.format("" if structure.slow_modes else _CREEP))
     return notes
 
 
-def _moved_at_first_level(record: Record) -> float:
+def _early_change(record: Record) -> float:
     """Change of the output before the input first changes, over the range of the output."""
     changes = np.flatnonzero(record.u != record.u[0])
     held_s = changes[0] / record.input_rate_hz if changes.size else np.inf
     held = record.y[record.output_time_s < held_s]
-    if held.size < _LEAST_HELD:
+    if held.size < _LEAST_EARLY:
         return 0.0
     tenth = max(1, held.size // 10)
     change = float(held[-tenth:].mean() - held[:tenth].mean())

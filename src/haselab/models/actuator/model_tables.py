@@ -109,7 +109,10 @@ class RationalTable(_Table):
 
 
 class NonlinearTable(_Table):
-    """The nonlinear part of a model, as far as files state its numbers; see `NonlinearFit`."""
+    """The nonlinear part of a model, with the gain of its linear part; see `NonlinearFit`.
+
+    `gain_2` and `gain_3` are the coefficients of a Hammerstein model about `operating_input`.
+    """
 
     kind: str
     operating_input: Number

@@ -183,7 +183,7 @@ class _Searches:
         return result
 
     def begin(self, key: Hashable, search: Callable[[], T]) -> Future[T]:
-        """Begin a search whose result will be needed, unless it is known or being made."""
+        """Begin a search, unless its result is known or it is already running."""
         with self._lock:
             found: Future[T] | None = self._known.pop(key, None)
             if found is None or (found.done() and found.exception() is not None):
@@ -216,6 +216,7 @@ def _find_dots(path: Path, stamp: tuple[int, int], number: int) -> tuple[Points,
 
 
 def _dots(path: Path, stamp: tuple[int, int], number: int) -> tuple[Points, DotProfile]:
+    """The same, searched once for each frame."""
     return _SEARCHES.result((path, stamp, number), lambda: _find_dots(path, stamp, number))
 
 
@@ -260,7 +261,7 @@ def _picture(videos: Videos, values: JsonObject) -> JsonObject:
     """A frame as a picture."""
     name, path, stamp, number = _of(videos, values)
     frame, count, time_s = _frame(path, stamp, number)
-    if videos.only is not None and number == 0:  # where its points are picked, soon
+    if videos.only is not None and number == 0:  # the user will pick points in this frame
         _SEARCHES.begin((path, stamp, number), lambda: _find_dots(path, stamp, number))
     low, high = grey_range(frame)
     grey = np.clip((frame - low) * (255.0 / (high - low)), 0, 255).astype(np.uint8)

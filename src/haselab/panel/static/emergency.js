@@ -8,7 +8,7 @@
   const ANSWER_MS = 3000; // the stop process waits 2 s for the bench process
   let pressed = false;
   let pressedAt = -Infinity;
-  let socket = null; // the browser sends its messages sooner than a request
+  let socket = null; // to STOP; a message on it leaves the browser sooner than a request
 
   const show = (text, bad) => {
     if (state.textContent !== text) state.textContent = text;

@@ -3,7 +3,7 @@ import { Requests } from "/static/requests.js";
 
 const SCHEMA = 1;
 const SILENT_MS = 900; // without a frame the connection is opened again
-const SLOW_MS = 50; // a page that takes longer for a draw acknowledges frames later
+const SLOW_MS = 50; // from this time for a draw on, a page acknowledges frames later
 const PATIENCE_MS = 20000; // longest wait for a connection: Chromium delays new ones after failures
 
 export class Link extends Requests {
@@ -17,7 +17,7 @@ export class Link extends Requests {
     this.framedAt = -Infinity;
     this.blockAge = 0; // when the last frame was sent, in s
     this.clock = 0; // of the bench process in the last frame, in s; the process refuses commands with an old time
-    this.ackDelay = 0; // of a slow page, which then gets fewer frames, in ms
+    this.ackDelay = 0; // in ms; a slow page then gets fewer frames
     this.patience = SILENT_MS; // with a socket that is connecting
     this.waiting = new Map();
     this.number = 0;

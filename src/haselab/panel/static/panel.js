@@ -6,7 +6,7 @@ import { useNumber } from "/static/number.js";
 
 const STALE_MS = 450;
 const MOST_PAUSE_MS = 1000; // between two draws
-const MOST_ACK_DELAY_MS = 200; // two frames are on the way at most, so the data are not stale
+const MOST_ACK_DELAY_MS = 200; // below STALE_MS: the server waits after two frames without an acknowledgement
 let frame = null;
 let charts = null;
 let redraw = () => {};
@@ -17,7 +17,7 @@ const link = new Link((found) => {
   if (!drawing) drawNewest();
 }, () => redraw());
 
-// Draws for a quarter of the time at most, so that a slow computer is free for STOP.
+// Pauses three times as long as a draw took, but for 1 s at most, so that a slow computer is free for STOP.
 async function drawNewest() {
   drawing = true;
   try {
@@ -27,8 +27,8 @@ async function drawNewest() {
       const begun_ms = performance.now();
       await draw();
       const took_ms = performance.now() - begun_ms;
-      // A draw during which the computer slept must not be followed by an equally long pause.
       link.ackDelay = Math.min(took_ms, MOST_ACK_DELAY_MS);
+      // The computer may have slept during the draw: the pause has a limit.
       await new Promise((resolve) => setTimeout(resolve, Math.min(3 * took_ms, MOST_PAUSE_MS)));
     }
   } finally {
@@ -93,7 +93,7 @@ function Live({ state, say }) {
 function Camera({ filming }) {
   const [seen, see] = useState({ url: "", age_s: null, size: [1, 1], points: [] });
   useEffect(() => {
-    let url = "", soon = 0, over = false;
+    let url = "", timer = 0, closed = false;
     async function look() {
       try {
         const answer = await fetch("/camera", { headers: { "X-Panel-Token": link.token }, signal: AbortSignal.timeout(2000) });
@@ -104,10 +104,10 @@ function Camera({ filming }) {
           if (old) setTimeout(() => URL.revokeObjectURL(old), 1000);
         } else see({ url: "", age_s: null, size: [1, 1], points: [] });
       } catch { see((last) => ({ ...last, age_s: Infinity })); }
-      if (!over) soon = setTimeout(look, filming ? 200 : 2000); // one request at a time
+      if (!closed) timer = setTimeout(look, filming ? 200 : 2000); // one request at a time
     }
     look();
-    return () => { over = true; clearTimeout(soon); };
+    return () => { closed = true; clearTimeout(timer); };
   }, [filming]);
   const old = !filming || !(seen.age_s < 1), { points, size } = seen;
   const moved = Math.max(...points.map(([x, y, x0, y0]) => Math.hypot(x - x0, y - y0)));

@@ -230,16 +230,27 @@ def read_input_curve(path: Path) -> InputCurve | None:
         InputError: the model is nonlinear in another way, or an impossible value.
     """
     data = {} if path.suffix.lower() == ".mat" else _data(path)
-    if "nonlinear" not in data:
+    stated = data.get("nonlinear") if isinstance(data, dict) else None
+    if stated is None:
         return None
-    table = validated(NonlinearTable, {**data["nonlinear"], "gain": data["gain"]}, path)
+    if not isinstance(stated, dict):
+        raise InputError(
+            f"nonlinear is {stated!r}, but must be an object with kind and operating_input. "
+            f"Identify the model again. {path}"
+        )
+    gain = _plant_of(data, path).get("gain")
+    table = validated(NonlinearTable, {**stated, "gain": gain}, path)
     if not table.kind.startswith("hammerstein"):
         raise InputError(
-            f"The model is nonlinear ({table.kind}), and a file has only its linear part. Compare "
-            f"it in Python with the method compare of the fit, or fit a linear model. {path}"
+            f"The model is nonlinear ({table.kind}), but of the nonlinear models in files only "
+            "Hammerstein models can be compared. In Python, use the method compare of the result "
+            f"of fit_nonlinear, or fit a linear model. {path}"
         )
     if table.gain == 0.0:
-        raise InputError(f"gain is 0, but a model needs another one. {path}")
+        raise InputError(
+            "gain is 0, but a Hammerstein model in a file needs another one. Identify the model "
+            f"about another mean input. {path}"
+        )
     factors = (1.0, table.gain_2 / table.gain, table.gain_3 / table.gain)
     return InputCurve(table.operating_input, factors)
 

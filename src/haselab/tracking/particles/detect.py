@@ -96,12 +96,12 @@ def _peaks(
     if not len(found):
         return found
     radius = max(1, round(radius_px))
-    beyond = max(0, radius - edge)  # of the windows; padding a large image takes long
-    padded = np.pad(response, beyond, constant_values=-np.inf) if beyond else response
+    pad = max(0, radius - edge)  # for windows beyond the image; padding a large one takes long
+    padded = np.pad(response, pad, constant_values=-np.inf) if pad else response
     around = sliding_window_view(padded, (2 * radius + 1,) * 2)
-    low = beyond - radius
+    shift = pad - radius
     largest = [
-        around[part[:, 0] + low, part[:, 1] + low].max(axis=(1, 2))
+        around[part[:, 0] + shift, part[:, 1] + shift].max(axis=(1, 2))
         for part in np.split(found, range(_AT_ONCE, len(found), _AT_ONCE))
     ]
     found = found[response[found[:, 0], found[:, 1]] == np.concatenate(largest)]

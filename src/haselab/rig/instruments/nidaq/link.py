@@ -29,9 +29,8 @@ _NO_CLOCK_ADVICE = (
     "If another program, such as 'haselab rig safe', has reset the board, start this program "
     "again; otherwise check daq.counter."
 )
-# Longest random pause after each attempt to shut down that met another program's attempt.
+# Longest random pause after each failed attempt to shut down: another program may do it as well.
 _PAUSES_S = (0.01, 0.02, 0.04, 0.08, 0.16, 0.32)
-_CHANCE = random.Random()
 _SILENT_S = 2e-3  # timeout after a server has not replied once, so that the guardian acts soon
 # DAQmx status: meaning, what to do.
 _EXPLANATIONS = {
@@ -221,17 +220,18 @@ class NidaqLink:
     def shut_down(self) -> None:
         """Reset the device, then put out 0 V, since its power-up state may be another voltage.
 
-        Several programs may do this at the same time, each resetting the task of the others.
+        Several programs may shut the device down at the same time, and each reset aborts the tasks
+        of the others. A failed attempt is therefore repeated after a random pause.
 
         Raises:
-            DeviceError: The device does not reply.
+            DeviceError: No attempt succeeded.
         """
         with self.translated_errors():
             for longest_s in _PAUSES_S:
                 try:
                     self._reset_to_zero()
                 except self._errors.DaqError:
-                    time.sleep(_CHANCE.uniform(0.0, longest_s))
+                    time.sleep(random.uniform(0.0, longest_s))
                 else:
                     return
             self._reset_to_zero()

@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import contextlib
+import fcntl
+import os
 import signal
 import socket
 import subprocess
@@ -119,6 +121,41 @@ def test_the_bench_is_at_zero_before_stop_ends(
     with processes.running_panel(PanelFiles(rig, None, tmp_path)):
         assert not ends
     assert ends[0] == "bench process" and "stop process" in ends
+
+
+def test_a_rig_safe_that_hangs_does_not_keep_the_bench_from_being_armed(tmp_path: Path) -> None:
+    assert not stop_process.rig_safe_runs(tmp_path)
+    path = tmp_path / stop_process._RIG_SAFE
+    with path.open("wb") as held_by_rig_safe:
+        fcntl.flock(held_by_rig_safe, fcntl.LOCK_SH)
+        assert stop_process.rig_safe_runs(tmp_path)
+        os.utime(path, (0.0, time.time() - stop_process._LONGEST_S - 1.0))
+        assert not stop_process.rig_safe_runs(tmp_path)
+        os.utime(path)
+        assert stop_process.rig_safe_runs(tmp_path)
+    assert not stop_process.rig_safe_runs(tmp_path)  # it has ended
+    path.unlink()
+    path.mkdir()
+    assert not stop_process.rig_safe_runs(tmp_path)
+
+
+@pytest.mark.parametrize("held", [False, True])
+def test_stop_starts_rig_safe_whoever_holds_its_lock(tmp_path: Path, held: bool) -> None:
+    path = tmp_path / stop_process._RIG_SAFE
+    with path.open("wb") as foreign:
+        if held:
+            fcntl.flock(foreign, fcntl.LOCK_EX)
+        stop = stop_process._Stop(tmp_path, "", str(tmp_path / "missing.toml"))
+        stop._rig_safe()
+        first = stop._safe
+        assert first is not None
+        assert held or stop_process.rig_safe_runs(tmp_path)
+        stop._rig_safe()
+        assert stop._safe is first, "one at a time"
+        assert first.wait(WAIT_S) == 2  # there is no such file
+        stop._rig_safe()
+        assert stop._safe is not first
+        assert stop._safe is not None and stop._safe.wait(WAIT_S) == 2
 
 
 def test_a_stop_process_that_hangs_is_killed() -> None:

@@ -39,6 +39,7 @@ _REASON = "STOP was pressed on the panel"
 _RIG_SAFE = "rig-safe.lock"  # in FOLDER, locked while `haselab rig safe` runs
 _NICENESS = -10
 _ANSWER_S = 2.0  # longest wait for the bench process
+_LONGEST_S = 20.0  # of `rig safe`, which waits for instruments for 5 s
 _PROMPT_S = 0.5  # after which the guardians are called
 _TRIALS = 20  # to find a port that is free on all addresses
 _SOCKET_ID = b"258EAFA5-E914-47DA-95CA-C5AB0DC85B11"  # RFC 6455, section 1.3
@@ -175,6 +176,7 @@ class _Stop:
         self._folder, self._rig = folder, rig
         self._interlock = Interlock(key)
         self._safe: subprocess.Popen[bytes] | None = None
+        self._begun_s = 0.0
         self._mutex = threading.Lock()
 
     def __call__(self) -> dict[str, object]:
@@ -208,28 +210,33 @@ class _Stop:
         return b""
 
     def _rig_safe(self) -> None:
-        """Start `haselab rig safe` on a real bench, unless it is running."""
+        """Start `haselab rig safe` on a real bench, unless it is running and does not hang."""
         if not self._rig:
             return
         with self._mutex:
-            if self._safe is None or self._safe.poll() is not None:
+            hangs = time.monotonic() > self._begun_s + _LONGEST_S
+            if self._safe is None or self._safe.poll() is not None or hangs:
+                self._begun_s = time.monotonic()
                 command = [sys.executable, "-m", "haselab.cli", "rig", "safe", self._rig]
                 with contextlib.ExitStack() as opened:
                     locks: list[int] = []
                     with contextlib.suppress(OSError):  # a full disk must not prevent `rig safe`
                         lock = opened.enter_context((self._folder / _RIG_SAFE).open("wb"))
-                        fcntl.flock(lock, fcntl.LOCK_SH)
+                        os.utime(lock.fileno())
+                        fcntl.flock(lock, fcntl.LOCK_SH | fcntl.LOCK_NB)
                         locks.append(lock.fileno())
                     self._safe = subprocess.Popen(command, stdin=subprocess.DEVNULL, pass_fds=locks)
 
 
 def rig_safe_runs(folder: Path) -> bool:
-    """Whether the `haselab rig safe` that STOP has started still runs.
+    """Whether the `haselab rig safe` that STOP has started still runs, and does not hang.
 
     Args:
         folder: of the panel.
     """
-    with contextlib.suppress(FileNotFoundError), (folder / _RIG_SAFE).open("rb") as lock:
+    with contextlib.suppress(OSError), (folder / _RIG_SAFE).open("rb") as lock:
+        if time.time() > os.fstat(lock.fileno()).st_mtime + _LONGEST_S:
+            return False
         try:
             fcntl.flock(lock, fcntl.LOCK_EX | fcntl.LOCK_NB)
         except BlockingIOError:

@@ -81,7 +81,10 @@ def test_compare_refuses_a_wiener_model(tmp_path):
     [
         ({"nonlinear": 5}, "nonlinear is 5, but must be an object"),
         ({"nonlinear": {"kind": "hammerstein-2"}}, "operating_input"),
-        ({"gain": 0.0}, "gain is 0, but a Hammerstein model"),
+        ({"gain": 0.0}, "gain is 0, too small for a Hammerstein model"),
+        ({"gain": 1e-12}, "gain is 1e-12, too small"),
+        ({"nonlinear": {"kind": "hammerstein-2", "operating_input": 1.0}}, "needs gain_2"),
+        ({"nonlinear": {"kind": "hammerstein-7", "operating_input": 1.0}}, "'hammerstein-7'"),
     ],
 )
 def test_a_damaged_nonlinear_model_is_refused(tmp_path, change, message):

@@ -59,6 +59,9 @@ _TABLE_CLOCK = 1e-3  # relative standard deviation of their times: 30 frames/s a
 )
 @shared_option("--zero-length-m", type=POSITIVE,
                detail="Used for tables with strains only. Default: that of A.toml.")  # fmt: skip
+@click.option("--added-inertia-kg", type=POSITIVE,
+              help="State where the search for the inertia without weight begins, such as that of "
+              "a lever, in kg. Default: 5 % of the hung mass.")  # fmt: skip
 @click.option("--zero-std-m", type=POSITIVE,
               help="Set the standard deviation of the zero of the lengths in m. Default: 5e-5 with "
               "tables, 2e-6 without.")  # fmt: skip
@@ -74,6 +77,7 @@ def actuator(
     masses_kg: tuple[float, ...],
     gain_v_per_v: float | None,
     zero_length_m: float | None,
+    added_inertia_kg: float | None,
     zero_std_m: float | None,
     columns: ColumnOptions,
     *,
@@ -124,7 +128,7 @@ def actuator(
     _warn_of_stated(files, records, gains_v_per_v, tables, actuator)
     tracked = all(file.is_dir() or is_session(file) for file in files)
     fit = fit_actuator(
-        law, records, mass_kg=mass_kg,
+        law, records, mass_kg=mass_kg, added_inertia_kg=added_inertia_kg,
         camera_bias_m=zero_std_m or (TRACKED_ZERO_M if tracked else _TABLE_ZERO_M),
         clock_std=0.0 if tracked else _TABLE_CLOCK,
     )  # fmt: skip

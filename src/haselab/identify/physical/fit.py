@@ -13,13 +13,14 @@ residuals and a model error (`model_error`) make it larger.
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import replace
 
 import numpy as np
 from numpy.typing import NDArray
 
 from haselab.actuators import ActuatorLaw
+from haselab.actuators.response import ADDED_INERTIA
 from haselab.base import InputError
 from haselab.identify.physical.misfit import CAPACITANCE, LENGTH, TRACKED_ZERO_M, Misfit
 from haselab.identify.physical.misstated import WrongScale, find_wrong_scale, suspect_scale
@@ -52,6 +53,8 @@ _SAME_NOISE = 0.02
 _USUAL_INERTIA = 0.05  # clamp and linkage over the hung mass
 # Added inertia over the hung mass: further starts, if the records contradict the model.
 _LARGE_INERTIAS = (1.0, 4.0)
+_MOST_INERTIA = 4.0  # of them, that is accepted: a time that is wrong by 2 imitates 3
+_SAME_EFFECT = "A wrong mass or a wrong unit of time has the same effect"
 _APART = 2.0  # rms over noise from which records are compared alone
 _FEW_STEPS = 8  # from what explains one record to what explains all, if that exists
 _MOVED = 4.0  # standard deviations of the zero; above, the lengths of a record count as shifted
@@ -105,7 +108,7 @@ def fit_actuator(
         fit = fit_from(_USUAL_INERTIA * mass_kg)
         if fit.status.startswith(CONTRADICTED):
             others = (fit_from(share * mass_kg) for share in _LARGE_INERTIAS)
-            fit = next((other for other in others if other.status == "ok"), fit)
+            fit = _with_large_inertia(fit, others, mass_kg)
     if not fit.succeeded:
         for remark in (remark for record in records for remark in record.repeated_remarks):
             fit = replace(fit, status=f"{fit.status}. {remark}. Record with finer steps")
@@ -114,6 +117,32 @@ def fit_actuator(
             return replace(fit, notes=(*fit.notes, f"{moving}."))
         return replace(fit, status=f"{fit.status}. {moving}")
     return fit
+
+
+def _with_large_inertia(
+    fit: ActuatorFit, others: Iterable[ActuatorFit], mass_kg: float
+) -> ActuatorFit:
+    """The first of the other fits that explains the records, if its inertia is plausible.
+
+    Args:
+        fit: from the usual inertia, which the records contradict.
+        others: from larger ones.
+        mass_kg: hung on the actuator.
+    """
+    found = next((other for other in others if other.status == "ok"), None)
+    if found is None:
+        return fit
+    inertia = found.parameters[ADDED_INERTIA]
+    times = inertia.value / mass_kg
+    if ADDED_INERTIA not in found.not_identifiable and times <= _MOST_INERTIA:
+        note = f"The added inertia is {times:.2g} times the hung mass. {_SAME_EFFECT}; check both."
+        return replace(found, notes=(note, *found.notes))
+    said = (
+        f"An added inertia of {inertia.value:.2g} kg, {times:.2g} times the hung mass, would "
+        f"explain them. {_SAME_EFFECT}. Check both; if they are right, begin there with "
+        f"--added-inertia-kg {inertia.value:.2g}"
+    )
+    return replace(fit, status=f"{fit.status}. {said}")
 
 
 def _fit(

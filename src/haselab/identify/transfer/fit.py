@@ -73,10 +73,11 @@ _FED_BACK = (
 )
 _EARLY = 0.1  # share of the output's range
 _LEAST_EARLY = 20  # outputs before the input first changes
+_SAME_LEVEL = 0.02  # of the input's range: noise of a measured input
 _EARLY_CHANGE = (
     "The output changes by {:.0f} % of its range before the input first changes: the plant was not "
     "at rest at the start, or the sensor drifts. The initial state is estimated, so this change "
-    "hardly determines the slow modes. Begin the record with some seconds at another, settled "
+    "says little about the slow modes. Begin the record with some seconds at another, settled "
     "level, or remove the drift."
 )
 _RESTING = (
@@ -562,7 +563,10 @@ def _notes(structure: TransferStructure, best: Best, estimates: dict[str, Estima
         notes.append(f"The delay is {shown}; the plant uses 0 s.")
     if structure.zeros == structure.poles and structure.delay == "auto":
         notes.append("With as many zeros as poles the delay is assumed to be 0 s.")
-    early = max(map(_early_change, best.records))
+    slow_s = max(
+        (e.value for n, e in estimates.items() if n.endswith("time_constant_s")), default=0.0
+    )
+    early = max(_early_change(record, slow_s) for record in best.records)
     if structure.slow_modes and structure.initial_state and early > _EARLY:
         notes.append(_EARLY_CHANGE.format(100.0 * early))
     if best.whiteness_p < 0.05:
@@ -570,12 +574,17 @@ def _notes(structure: TransferStructure, best: Best, estimates: dict[str, Estima
     return notes
 
 
-def _early_change(record: Record) -> float:
-    """Change of the output before the input first changes, over the range of the output."""
-    changes = np.flatnonzero(record.u != record.u[0])
-    held_s = changes[0] / record.input_rate_hz if changes.size else np.inf
+def _early_change(record: Record, slow_s: float) -> float:
+    """Change of the output before the input first changes, over the range of the output.
+
+    Args:
+        record: of an experiment.
+        slow_s: time constant of the slowest mode; a change in less than half of it is fast.
+    """
+    changes = np.flatnonzero(np.abs(record.u - record.u[0]) > _SAME_LEVEL * np.ptp(record.u))
+    held_s = changes[0] / record.input_rate_hz if changes.size else record.duration_s
     held = record.y[record.output_time_s < held_s]
-    if held.size < _LEAST_EARLY:
+    if held.size < _LEAST_EARLY or held_s < 0.5 * slow_s:
         return 0.0
     tenth = max(1, held.size // 10)
     change = float(held[-tenth:].mean() - held[:tenth].mean())

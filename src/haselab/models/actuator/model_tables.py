@@ -117,8 +117,8 @@ class NonlinearTable(_Table):
     kind: str
     operating_input: Number
     gain: _Quantity
-    gain_2: _Quantity = 0.0
-    gain_3: _Quantity = 0.0
+    gain_2: _Quantity | None = None
+    gain_3: _Quantity | None = None
 
 
 class CovarianceTable(_Table):

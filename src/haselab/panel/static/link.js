@@ -3,7 +3,6 @@ import { Requests } from "/static/requests.js";
 
 const SCHEMA = 1;
 const SILENT_MS = 900; // without a frame the connection is opened again
-const SLOW_MS = 50; // from this time for a draw on, a page acknowledges frames later
 const PATIENCE_MS = 20000; // longest wait for a connection: Chromium delays new ones after failures
 
 export class Link extends Requests {
@@ -17,7 +16,6 @@ export class Link extends Requests {
     this.framedAt = -Infinity;
     this.blockAge = 0; // when the last frame was sent, in s
     this.clock = 0; // of the bench process in the last frame, in s; the process refuses commands with an old time
-    this.ackDelay = 0; // in ms; a slow page then gets fewer frames
     this.patience = SILENT_MS; // with a socket that is connecting
     this.waiting = new Map();
     this.number = 0;
@@ -45,7 +43,7 @@ export class Link extends Requests {
     socket.onmessage = ({ data }) => {
       if (socket !== this.socket) return; // an old connection: its frames are old
       if (typeof data === "string") this.heard(JSON.parse(data));
-      else this.framed(data, socket);
+      else this.framed(data);
     };
     socket.onclose = ({ code, reason }) => {
       if (socket !== this.socket) return;
@@ -87,7 +85,7 @@ export class Link extends Requests {
     if (answer) answer(message);
   }
 
-  framed(buffer, socket) {
+  framed(buffer) {
     const head = new DataView(buffer);
     if (head.getUint16(0, true) !== SCHEMA) { location.reload(); return; }
     const number = head.getUint32(4, true);
@@ -111,8 +109,7 @@ export class Link extends Requests {
     this.patience = SILENT_MS;
     this.blockAge = about.age_s;
     this.clock = about.clock_s;
-    if (this.ackDelay < SLOW_MS) this.send({ ack: number });
-    else setTimeout(() => { if (socket === this.socket) this.send({ ack: number }); }, this.ackDelay);
+    this.send({ ack: number });
     this.onFrame({ ...about, monitors, signals });
   }
 

@@ -6,7 +6,6 @@ import { useNumber } from "/static/number.js";
 
 const STALE_MS = 450;
 const MOST_PAUSE_MS = 1000; // between two draws
-const MOST_ACK_DELAY_MS = 200; // below STALE_MS: the server waits after two frames without an acknowledgement
 let frame = null;
 let charts = null;
 let redraw = () => {};
@@ -27,7 +26,6 @@ async function drawNewest() {
       const begun_ms = performance.now();
       await draw();
       const took_ms = performance.now() - begun_ms;
-      link.ackDelay = Math.min(took_ms, MOST_ACK_DELAY_MS);
       // The computer may have slept during the draw: the pause has a limit.
       await new Promise((resolve) => setTimeout(resolve, Math.min(3 * took_ms, MOST_PAUSE_MS)));
     }

@@ -49,6 +49,7 @@ MAT_NAME = "model"
 
 _Checked = TypeVar("_Checked", bound=PolesTable)
 _USUAL = LoopSetting()
+_LEAST_GAIN = 1e-6  # of the largest one
 _SAME = 1e-3  # relative difference of responses: a file rounded by hand has fewer digits
 
 
@@ -240,19 +241,25 @@ def read_input_curve(path: Path) -> InputCurve | None:
         )
     gain = _plant_of(data, path).get("gain")
     table = validated(NonlinearTable, {**stated, "gain": gain}, path)
-    if not table.kind.startswith("hammerstein"):
+    if table.kind.startswith(("duffing", "wiener")):
         raise InputError(
             f"The model is nonlinear ({table.kind}), but of the nonlinear models in files only "
             "Hammerstein models can be compared. In Python, use the method compare of the result "
             f"of fit_nonlinear, or fit a linear model. {path}"
         )
-    if table.gain == 0.0:
+    degree = {"hammerstein-2": 2, "hammerstein-3": 3}.get(table.kind)
+    gains = (table.gain, table.gain_2, table.gain_3)[:degree]
+    if degree is None or None in gains:
         raise InputError(
-            "gain is 0, but a Hammerstein model in a file needs another one. Identify the model "
-            f"about another mean input. {path}"
+            f"The nonlinear part has kind {table.kind!r}. hammerstein-2 needs gain_2, and "
+            f"hammerstein-3 also gain_3. Identify the model again. {path}"
         )
-    factors = (1.0, table.gain_2 / table.gain, table.gain_3 / table.gain)
-    return InputCurve(table.operating_input, factors)
+    if abs(table.gain) < _LEAST_GAIN * max(abs(gain or 0.0) for gain in gains):
+        raise InputError(
+            f"gain is {table.gain:g}, too small for a Hammerstein model in a file. Identify the "
+            f"model about another mean input. {path}"
+        )
+    return InputCurve(table.operating_input, tuple((gain or 0.0) / table.gain for gain in gains))
 
 
 def loop_of(

@@ -31,6 +31,7 @@ _NO_CLOCK_ADVICE = (
 )
 # Longest random pause after each failed attempt to shut down: another program may do it as well.
 _PAUSES_S = (0.01, 0.02, 0.04, 0.08, 0.16, 0.32)
+_RETRY_S = 0.7
 _SILENT_S = 2e-3  # timeout after a server has not replied once, so that the guardian acts soon
 # DAQmx status: meaning, what to do.
 _EXPLANATIONS = {
@@ -226,11 +227,14 @@ class NidaqLink:
         Raises:
             DeviceError: No attempt succeeded.
         """
+        begun_s = time.monotonic()
         with self.translated_errors():
             for longest_s in _PAUSES_S:
                 try:
                     self._reset_to_zero()
                 except self._errors.DaqError:
+                    if time.monotonic() > begun_s + _RETRY_S:  # a device that is slow to fail
+                        raise
                     time.sleep(random.uniform(0.0, longest_s))
                 else:
                     return

@@ -227,7 +227,8 @@ def strains_of(
         raise InputError(
             f"Column {column} is from {least:.4g} to {largest:.4g} m, but the length at strain 0 "
             f"is zero_length_m = {zero_m:g} m, so its values are neither displacements nor lengths."
-            f" Correct zero_length_m, or state the unit of the column with --unit: {file}"
+            " Correct zero_length_m, or state the unit of the column with --unit. A distance that "
+            f"falls while the actuator lengthens must be subtracted from a constant first: {file}"
         )
     low, high = float(np.nanmin(strain)), float(np.nanmax(strain))
     click.echo(

@@ -78,6 +78,17 @@ def test_what_a_foreign_page_sends_besides_is_no_further_request(
     assert pressed == []
 
 
+STOP = b"\x81\x84\x01\x02\x03\x04stop"  # a frame: text, masked, 4 bytes
+
+
+def wait_for(pressed: list[int], count: int) -> None:
+    """Wait until STOP has come as often as this; only a hang ends the wait."""
+    end_s = time.monotonic() + WAIT_S
+    while len(pressed) < count:
+        assert time.monotonic() < end_s
+        time.sleep(0.01)
+
+
 def upgrade(port: int, origin: str = "") -> socket.socket:
     """A WebSocket to STOP, with the example key of RFC 6455."""
     link = socket.create_connection(("127.0.0.1", port), WAIT_S)
@@ -102,11 +113,8 @@ def test_each_message_of_a_web_socket_stops(
         head = connected.recv(4096).decode()
         assert head.startswith("HTTP/1.1 101 ")
         assert "Sec-WebSocket-Accept: s3pPLMBiTxaQ9kYGzzhZRbK+xOo=" in head  # RFC 6455, 1.3
-        connected.sendall(b"\x81\x84\x01\x02\x03\x04stop")
-        end_s = time.monotonic() + WAIT_S
-        while len(pressed) < 3:
-            assert time.monotonic() < end_s
-            time.sleep(0.01)
+        connected.sendall(STOP)
+        wait_for(pressed, 3)
         connected.close()
     assert pressed == [1, 1, 1] and not faults
 
@@ -131,11 +139,8 @@ def test_other_frames_end_only_their_connection(
         assert link.recv(4096) == b""
     with upgrade(found.port) as link:
         link.recv(4096)
-        link.sendall(b"\x81\x84\x01\x02\x03\x04stop")
-        end_s = time.monotonic() + WAIT_S
-        while not pressed:
-            assert time.monotonic() < end_s
-            time.sleep(0.01)
+        link.sendall(STOP)
+        wait_for(pressed, 1)
     assert pressed == [1] and not faults
 
 
@@ -144,6 +149,6 @@ def test_a_foreign_page_gets_no_web_socket(
 ) -> None:
     found, pressed, _ = server
     with upgrade(found.port, "Origin: http://other.example\r\n") as link:
-        link.sendall(b"\x81\x84\x01\x02\x03\x04stop")
+        link.sendall(STOP)
         assert link.recv(4096).startswith(b"HTTP/1.1 403 ")
     assert pressed == []

@@ -28,6 +28,7 @@ from haselab.identify.transfer.checks.preconditions import (
     runs_away,
     too_few_tones,
 )
+from haselab.identify.transfer.checks.remarks import remarks_of
 from haselab.identify.transfer.feedback import feedback_p
 from haselab.identify.transfer.layout import Layout, TransferStructure, layout_of
 from haselab.identify.transfer.oversampled import at_lower_rate
@@ -58,27 +59,12 @@ _UNEXPLAINED = (
     "no result: the model explains {:.1f} % of the output, and the residuals still follow the "
     "input; check --input and --output, or fit more poles"
 )
-_NOT_WHITE = (
-    "The residuals are not white: the model does not explain everything, and the intervals are "
-    "valid only if its structure is right. Try {}--choose nonlinear (such as the square of a "
-    "voltage), or --choose all."
-)
-_CREEP = "--slow-modes 1 (creep), "
 _FEEDBACK = 1e-6  # probability below which the input follows the residuals
 _NO_DISTURBANCE = 99.0  # per cent of fit above which no disturbance matters
 _FED_BACK = (
     "The residuals predict the input. If a loop was closed during the record, a disturbance that "
     "is not white biases the gain and the delay, and the intervals do not include this bias. "
     "Record in open loop, or use a larger reference signal."
-)
-_EARLY = 0.1  # share of the output's range
-_LEAST_EARLY = 20  # outputs before the input first changes
-_SAME_LEVEL = 0.02  # of the input's range: noise of a measured input
-_EARLY_CHANGE = (
-    "The output changes by {:.0f} % of its range before the input first changes: the plant was not "
-    "at rest at the start, or the sensor drifts. The initial state is estimated, so this change "
-    "says little about the slow modes. Begin the record with some seconds at another, settled "
-    "level, or remove the drift."
 )
 _RESTING = (
     "A step at t = 0 is indistinguishable from an initial state; rest before it is assumed. "
@@ -531,7 +517,7 @@ def _describe(layout: Layout, best: Best, rounds: int = 3) -> TransferFit:
         fit_percent=fit_percent([r.y for r in records], modelled),
         residual_whiteness_p=best.whiteness_p,
         residuals=tuple(residuals),
-        notes=(*notes, *_notes(layout.structure, best, estimates)),
+        notes=(*notes, *remarks_of(layout.structure, best, estimates)),
         best=best,
         other_minima=other_minima,
         ambiguous=bool(doubt),
@@ -552,40 +538,3 @@ def _validation(layout: Layout, best: Best) -> float:
         [record.y[cut:] for record, cut in zip(records, cuts, strict=True)],
         [output[cut:] for output, cut in zip(predicted, cuts, strict=True)],
     )
-
-
-def _notes(structure: TransferStructure, best: Best, estimates: dict[str, Estimate]) -> list[str]:
-    notes = []
-    delay = estimates["delay_s"]
-    if delay.value < 0.0:
-        zero = delay.ci95[1] >= 0.0
-        shown = "not significantly above zero" if zero else "below zero (check the clocks)"
-        notes.append(f"The delay is {shown}; the plant uses 0 s.")
-    if structure.zeros == structure.poles and structure.delay == "auto":
-        notes.append("With as many zeros as poles the delay is assumed to be 0 s.")
-    slow_s = max(
-        (e.value for n, e in estimates.items() if n.endswith("time_constant_s")), default=0.0
-    )
-    early = max(_early_change(record, slow_s) for record in best.records)
-    if structure.slow_modes and structure.initial_state and early > _EARLY:
-        notes.append(_EARLY_CHANGE.format(100.0 * early))
-    if best.whiteness_p < 0.05:
-        notes.append(_NOT_WHITE.format("" if structure.slow_modes else _CREEP))
-    return notes
-
-
-def _early_change(record: Record, slow_s: float) -> float:
-    """Change of the output before the input first changes, over the range of the output.
-
-    Args:
-        record: of an experiment.
-        slow_s: time constant of the slowest mode; a change in less than half of it is fast.
-    """
-    changes = np.flatnonzero(np.abs(record.u - record.u[0]) > _SAME_LEVEL * np.ptp(record.u))
-    held_s = changes[0] / record.input_rate_hz if changes.size else record.duration_s
-    held = record.y[record.output_time_s < held_s]
-    if held.size < _LEAST_EARLY or held_s < 0.5 * slow_s:
-        return 0.0
-    tenth = max(1, held.size // 10)
-    change = float(held[-tenth:].mean() - held[:tenth].mean())
-    return abs(change) / max(float(np.ptp(record.y)), 1e-300)

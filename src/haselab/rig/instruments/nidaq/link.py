@@ -32,6 +32,7 @@ _NO_CLOCK_ADVICE = (
 # Longest random pause after each failed attempt to shut down: another program may do it as well.
 _PAUSES_S = (0.01, 0.02, 0.04, 0.08, 0.16, 0.32)
 _RETRY_S = 0.7
+_CHANCE = random.SystemRandom()  # programs with one seed must not wait equally long
 _SILENT_S = 2e-3  # timeout after a server has not replied once, so that the guardian acts soon
 # DAQmx status: meaning, what to do.
 _EXPLANATIONS = {
@@ -235,7 +236,7 @@ class NidaqLink:
                 except self._errors.DaqError:
                     if time.monotonic() > begun_s + _RETRY_S:  # a device that is slow to fail
                         raise
-                    time.sleep(random.uniform(0.0, longest_s))
+                    time.sleep(_CHANCE.uniform(0.0, longest_s))
                 else:
                     return
             self._reset_to_zero()

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -16,11 +17,12 @@ from haselab.models.plant import Plant
 from haselab.models.posterior import PlantPosterior
 from haselab.models.rational import RationalModel
 
-__all__ = ["fitted_output", "predict"]
+__all__ = ["fitted_output", "note_range", "predict"]
 
 Floats = NDArray[np.float64]
 _DRAWS = 100
 _HALF_WIDTH = 1.959963984540054  # standard deviations of a 95 % interval
+_BEYOND = 0.05  # of the width of the fitted range: what noise adds at its ends
 _SLOWEST = 10.0  # lengths of a record beyond which a free response counts as a straight line
 
 
@@ -74,6 +76,32 @@ def predict(
         [record.y for record in records], modelled, half, noise_std=noise_std,
         without_input=alone, training_output=training_output,
     )  # fmt: skip
+
+
+def note_range(
+    found: Prediction, records: Record | Sequence[Record], fitted: tuple[float, float] | None
+) -> Prediction:
+    """Note inputs that the record of the fit did not reach.
+
+    Args:
+        found: the prediction of the records.
+        records: with the inputs of the recording, in the unit of `fitted`.
+        fitted: lowest and highest input of the fit; None: not known.
+    Returns:
+        The prediction; with a note if an input is outside by more than 5 % of the range.
+    """
+    if fitted is None:
+        return found
+    low = min(float(record.u.min()) for record in several(records))
+    high = max(float(record.u.max()) for record in several(records))
+    slack = _BEYOND * (fitted[1] - fitted[0])
+    if low >= fitted[0] - slack and high <= fitted[1] + slack:
+        return found
+    note = (
+        f"The input goes from {low:.4g} to {high:.4g}, but the model was fitted to inputs from "
+        f"{fitted[0]:.4g} to {fitted[1]:.4g}: an error can come from the wider range alone"
+    )
+    return replace(found, notes=(*found.notes, note))
 
 
 def _spread(

@@ -44,7 +44,7 @@ def number_text(value: float | None) -> str:
     exponent = _exponent(abs(value))
     mantissa = value / 10.0**exponent
     decimals = _SIGNIFICANT - 1 - (math.floor(math.log10(abs(mantissa))) if mantissa else 0)
-    text = f"{mantissa:.{max(decimals, 0)}f}"
+    text = f"{mantissa:z.{max(decimals, 0)}f}"
     return _with_power(text.rstrip("0").rstrip(".") if "." in text else text, exponent)
 
 
@@ -64,6 +64,8 @@ def interval_text(
     Example:
         >>> interval_text(5.1134, 0.0213, (5.0717, 5.1551))
         ('5.113', '[5.072, 5.155]')
+        >>> interval_text(-2e-5, 0.0021, (-0.0041, 0.0041))
+        ('0.0000', '[−0.0041, 0.0041]')
     """
     if value is None or not math.isfinite(value):
         return ABSENT, ABSENT
@@ -75,7 +77,7 @@ def interval_text(
     scale = 10.0**exponent
     decimals = min(max(1 - math.floor(math.log10(std / scale)), 0), 9)
     texts = [
-        f"{number / scale:.{decimals}f}" if number is not None else "open"
+        f"{number / scale:z.{decimals}f}" if number is not None else "open"
         for number in (value, *ends)
     ]
     return (

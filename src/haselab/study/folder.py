@@ -45,7 +45,7 @@ _FOUND: Mapping[type, tuple[str, ...]] = {  # sections by the type of the findin
 # Keys of a model and a design that are removed from the file that the run started from.
 _OF_AN_OLDER_MODEL = (
     "poles", "zeros", "numerator", "denominator", "slow_modes", "delay_s", "fit_percent",
-    "fitted_to", "training_output", "input_unit", "output_unit",
+    "fitted_to", "training_output", "input_range", "input_unit", "output_unit",
 )  # fmt: skip
 _OF_AN_OLDER_DESIGN = ("name", "predicted", "plausible", "uncertainty")
 _START = """\

@@ -9,6 +9,7 @@ from click.testing import CliRunner
 import haselab as hl
 from haselab.base import InputError
 from haselab.cli.main import cli
+from haselab.identify.transfer.fit import fit_transfer
 from haselab.identify.transfer.layout import TransferStructure
 from haselab.identify.transfer.nonlinear import fit_nonlinear
 from haselab.models import Plant
@@ -130,3 +131,28 @@ def test_a_record_that_begins_with_its_first_step_says_so(before_s):
     found = hl.Record(u[kept], rate_hz, y[kept], time_s[kept] - time_s[kept][0])
     fit = hl.fit_transfer(found, TransferStructure(slow_modes=1))
     assert any("before the input first changes" in note for note in fit.notes) == (not before_s)
+
+
+@pytest.mark.parametrize(
+    ("scale", "noted"), [(1.0, False), (1.04, False), (1.2, True), (0.3, False)]
+)
+@pytest.mark.parametrize("kind", [None, "hammerstein-2"])
+def test_compare_notes_inputs_beyond_those_of_the_fit(tmp_path, scale, noted, kind):
+    """Random steps of 0 to 2; with --nonlinear the range is that of the recorded input."""
+    curve = np.square if kind else lambda u: u
+    first, new = record(tmp_path / "1.csv", 1, curve), tmp_path / "2.csv"
+    table = np.genfromtxt(record(new, 2, curve), delimiter=",", names=True)
+    u = scale * table["u"]
+    y = Plant(0.5, 5.11, 0.09).simulate(curve(u), RATE_HZ, table["time_s"])
+    y += NOISE * np.random.default_rng(3).normal(size=y.size)
+    columns = np.column_stack([table["time_s"], u, y])
+    np.savetxt(new, columns, "%.17g", ",", header="time_s,u,y", comments="")
+    model, options = tmp_path / "model.json", ("--nonlinear", kind) if kind else ()
+    invoke("identify", "transfer", first, *options, "--hold", "zero", "--out", model)
+    result = invoke("compare", model, new, "--hold", "zero", "--json")
+    assert result.exit_code == 0, result.output
+    notes = json.loads(result.stdout)["notes"]
+    assert any("the model was fitted to inputs from 0" in note for note in notes) == noted
+    one = hl.records(first, hold="zero")
+    fit = fit_nonlinear(one, TransferStructure(), kind) if kind else fit_transfer(one)
+    assert notes == list(fit.compare(hl.records(new, hold="zero")).notes)

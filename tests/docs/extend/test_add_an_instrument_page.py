@@ -8,6 +8,10 @@ from __future__ import annotations
 import importlib.util
 import json
 import re
+import signal
+import socket
+import subprocess
+import sys
 import tomllib
 from collections.abc import Iterator
 from contextlib import ExitStack
@@ -63,6 +67,21 @@ def lab(make_shell) -> Iterator[Lab]:
         assert tomllib.loads(text)["supply"]["kind"] == "mysupply"
         (shell.folder / "bench.toml").write_text(text)
         yield Lab(shell, emulator, twin)
+
+
+def test_the_emulator_runs_as_a_program() -> None:
+    script = PACKAGE / "tests" / "emulator.py"
+    assert f"python haselab-mysupply/tests/{script.name}`; it prints its `host` and `port`" in TEXT
+    with subprocess.Popen([sys.executable, script, "0"], stdout=subprocess.PIPE, text=True) as run:
+        try:
+            assert run.stdout is not None
+            at = tomllib.loads(run.stdout.readline() + run.stdout.readline())
+            with socket.create_connection((at["host"], at["port"]), 10.0) as line:
+                line.sendall(b"*IDN?\n")
+                assert line.makefile().readline().startswith("ACME,HV-3000,A1234")
+        finally:
+            run.send_signal(signal.SIGINT)
+    assert run.returncode == 0
 
 
 def test_the_driver_is_as_short_as_the_page_says() -> None:

@@ -1,8 +1,13 @@
-"""The supply of the example as a TCP server: written from its manual, not from the driver."""
+"""The supply of the example as a TCP server: written from its manual, not from the driver.
+
+Run it as a program to try the driver without the instrument: python emulator.py [PORT]
+"""
 
 from __future__ import annotations
 
+import contextlib
 import socketserver
+import sys
 import threading
 import time
 from typing import Self
@@ -13,9 +18,9 @@ _TIME_CONSTANT_S = 0.05  # of its output
 
 
 class Emulator:
-    """Serves SCPI on a loopback port. `commands` are all lines that it was sent."""
+    """Serves SCPI on a loopback port (0: a free one). `commands` are all lines that it got."""
 
-    def __init__(self) -> None:
+    def __init__(self, port: int = 0) -> None:
         self.set_v, self.is_on = 0.0, False
         self.commands: list[str] = []
         self._output_v, self._changed_s = 0.0, time.monotonic()
@@ -32,7 +37,7 @@ class Emulator:
         class Server(socketserver.ThreadingTCPServer):
             daemon_threads, allow_reuse_address = True, True
 
-        self._server = Server(("127.0.0.1", 0), Handler)
+        self._server = Server(("127.0.0.1", port), Handler)
         self.port = int(self._server.server_address[1])
         threading.Thread(target=self._server.serve_forever, args=(0.01,), daemon=True).start()
 
@@ -76,3 +81,10 @@ class Emulator:
 
     def __exit__(self, *_: object) -> None:
         self.close()
+
+
+if __name__ == "__main__":
+    with Emulator(int(sys.argv[1]) if len(sys.argv) > 1 else 5025) as emulator:
+        print(f'host = "127.0.0.1"\nport = {emulator.port}', flush=True)
+        with contextlib.suppress(KeyboardInterrupt):
+            threading.Event().wait()

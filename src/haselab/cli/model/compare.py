@@ -36,7 +36,7 @@ from haselab.cli.model.physical_model import has_physical_model
 from haselab.cli.options import shared_option
 from haselab.cli.plot import save_plot
 from haselab.identify.fit import Prediction
-from haselab.identify.prediction import predict
+from haselab.identify.prediction import note_range, predict
 from haselab.identify.record import HOLDS, Record
 from haselab.identify.training_output import TrainingOutput, is_comparable
 from haselab.models.actuator.model_tables import OriginTable
@@ -182,6 +182,7 @@ def command(
     no_band = no_band if curve is None else _NO_CURVE
     through = model if through_voltage_map else None
     records: list[Record] = []
+    recorded: list[Record] = []
     for file in files:
         with name_files_in_errors(file):
             found = read_recorded(
@@ -189,6 +190,7 @@ def command(
                 to_strain=origin.output_unit != "m",
             )  # fmt: skip
             _check_units(origin, found.units, (source, output), through_voltage_map)
+            recorded += found.records
             records += found.records if curve is None else map(curve.apply_to, found.records)
             measured_name = output_name(output, found.units[1], through_voltage_map)
             axes = axis_names(source, measured_name, found.units)
@@ -202,6 +204,7 @@ def command(
             training_output=_training_output(origin),
             rng=np.random.default_rng(seed),
         )
+    prediction = note_range(prediction, recorded, origin.input_range)
     if math.isnan(prediction.used_for_fit):
         why = _why_unknown(_training_output(origin), records)
         click.echo(f"haselab: warning: {why}. {model}", err=True)

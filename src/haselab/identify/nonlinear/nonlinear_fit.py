@@ -14,6 +14,7 @@ from numpy.typing import ArrayLike, NDArray
 from haselab.base import Estimate, JsonObject, ResultError, checked
 from haselab.identify.fit import Prediction, RecordFit
 from haselab.identify.noise import fit_percent
+from haselab.identify.prediction import note_range
 from haselab.identify.record import Record, finite_vector
 from haselab.identify.residual_tests import input_correlation_p
 from haselab.identify.transfer.fit import TransferFit
@@ -135,7 +136,7 @@ class NonlinearFit(TransferFit):
     @checked
     def compare(self, records: Record | Sequence[Record]) -> Prediction:
         """See `RecordFit`; there is no band."""
-        return RecordFit.compare(self, records)
+        return note_range(RecordFit.compare(self, records), records, self.input_range)
 
     def _modelled(self, record: Record) -> tuple[Floats, Floats]:
         return record.y, self._usable().modelled(record)

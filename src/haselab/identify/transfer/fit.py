@@ -16,7 +16,7 @@ from haselab.base.chart import Chart
 from haselab.identify.charts import records_chart
 from haselab.identify.fit import Prediction, RecordFit, several
 from haselab.identify.noise import coloured_covariance, fit_percent
-from haselab.identify.prediction import fitted_output, predict
+from haselab.identify.prediction import fitted_output, note_range, predict
 from haselab.identify.record import Record, finite_vector, record_notes
 from haselab.identify.residual_tests import input_correlation_p
 from haselab.identify.transfer.bode import bode_panels
@@ -208,6 +208,14 @@ class TransferFit(RecordFit[Record]):
         return PlantPosterior.from_dict(covariance_table(self.parameters, self.covariance))
 
     @property
+    def input_range(self) -> tuple[float, float] | None:
+        """Lowest and highest input of the records; None without records."""
+        inputs = [record.u for record in self.records]
+        if not inputs:
+            return None
+        return min(float(u.min()) for u in inputs), max(float(u.max()) for u in inputs)
+
+    @property
     def _spread(self) -> PlantPosterior | None:
         """The posterior; None if a parameter is not identifiable."""
         return None if np.isinf(self.covariance).any() else self.posterior
@@ -222,7 +230,7 @@ class TransferFit(RecordFit[Record]):
     @checked
     def compare(self, records: Record | Sequence[Record]) -> Prediction:
         """See `RecordFit`; the band is that of the covariance and of the residuals."""
-        return predict(
+        found = predict(
             self.rational,
             several(records),
             posterior=self._spread,
@@ -230,6 +238,7 @@ class TransferFit(RecordFit[Record]):
             training_output=self.training_output,
             rng=np.random.default_rng(1),
         )
+        return note_range(found, records, self.input_range)
 
     def _modelled(self, record: Record) -> tuple[Floats, Floats]:
         return record.y, fitted_output(self.rational, record)
@@ -271,6 +280,7 @@ class TransferFit(RecordFit[Record]):
             "covariance": covariance_table(self.parameters, self.covariance),
             "residual_std": float(np.sqrt(np.mean(residuals**2))) if residuals.size else None,
             "training_output": None if known is None else known.to_dict(),
+            "input_range": self.input_range,
             "other_minima": [
                 {"numbers": r.numbers, "log_likelihood_below": r.log_likelihood_below}
                 for r in self.other_minima

@@ -175,6 +175,7 @@ class OriginTable(_Table):
     output_unit: str = ""
     residual_std: Annotated[Number, Field(ge=0)] | None = None
     training_output: TrainingOutputTable | None = None
+    input_range: tuple[Number, Number] | None = None
     through_voltage_map: tuple[Number, Number, Number, Number] | None = None
 
     @property

@@ -22,7 +22,8 @@ _WRITTEN = {
     "sensing": ("date", "amplifier", "rate_hz", "scale_std_s", "stray_s", "offsets_v", "residual",
                 "reference"),
     "model": (*PlantTable.model_fields, *RationalTable.model_fields, "fit_percent", "input_unit",
-              "output_unit", "training_output", "through_voltage_map", "linear_models"),
+              "output_unit", "training_output", "through_voltage_map", "linear_models",
+              "input_range"),
     "controller": ("predicted", "plausible", "uncertainty"),
 }  # fmt: skip
 _GAINS = ("kp", "ki", "kd", "derivative_filter_s")

@@ -34,6 +34,7 @@ MODEL_KEYS = (
     "gain", "natural_frequency_rad_s", "damping_ratio", "delay_s", "slow_modes", "poles", "zeros",
     "numerator", "denominator", "covariance", "residual_std", "fit_percent", "input", "output",
     "input_unit", "output_unit", "training_output", "fitted_to", "through_voltage_map",
+    "input_range",
 )  # fmt: skip
 CONTROLLER_KEYS = (
     "kind", "name", "parameters", "limits", "loop", "margins", "demands", "predicted", "plausible",
@@ -86,6 +87,7 @@ def model_section(
         "residual_std": float(np.sqrt(np.mean(residuals**2))),
         "covariance": fit.posterior.to_dict(),
         "training_output": None if known is None else known.to_dict(),
+        "input_range": fit.input_range,
     }
 
 

@@ -19,7 +19,7 @@ __all__ = ["bode_panels"]
 Floats = NDArray[np.float64]
 Complexes = NDArray[np.complex128]
 _POINTS, _DRAWS, _SEED = 300, 200, 1
-_MOST_POINTS = 20000  # samples of the records; more would make the figure slow
+_LONG = 20000  # samples of the records, from which segments are averaged, which takes less time
 
 
 def bode_panels(
@@ -34,8 +34,7 @@ def bode_panels(
         model: the fitted model.
         posterior: with the covariance of its parameters; None: no band is drawn.
         records: that were fitted. Their frequency response is drawn if it can be estimated: input
-            and output have the same times, the input varies enough, and there are at most 20,000
-            samples.
+            and output have the same times, and the input varies enough.
         names: of the axes of input and output, for the unit of the magnitude.
     Returns:
         The panel of the magnitude and that of the phase.
@@ -75,10 +74,9 @@ def _deviations(
 
 def _measured(records: Sequence[Record]) -> tuple[Floats, Complexes] | None:
     """Frequencies in Hz and response of the records; None where it cannot be estimated."""
-    if sum(record.y.size for record in records) > _MOST_POINTS:
-        return None
+    long = sum(record.y.size for record in records) > _LONG
     try:
-        found = estimate_frequency_response(records, method="polynomial")
+        found = estimate_frequency_response(records, method="h1" if long else "polynomial")
     except InputError:
         return None
     used = (found.frequency_hz > 0.0) & np.isfinite(found.response)

@@ -30,12 +30,9 @@ from tests.panel.running import WAIT_S
 class Process:
     """A process that runs."""
 
-    def poll(self) -> None:
-        """It has not ended."""
-
-    def wait(self, timeout_s: float) -> None:
+    def wait(self) -> None:
         """It does not end."""
-        time.sleep(timeout_s)
+        threading.Event().wait()
 
 
 def test_a_panel_whose_stop_hangs_ends(monkeypatch: pytest.MonkeyPatch) -> None:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import contextlib
 import ipaddress
+import subprocess
 import tempfile
 import threading
 import time
@@ -126,21 +127,17 @@ def _serve(panel: Panel) -> None:
                 panel.server.should_exit = True
             time.sleep(1.0)
 
-    def watch() -> None:
-        while not panel.server.should_exit:
-            for name, process in (("bench process", panel.bench), ("stop process", panel.stop)):
-                with contextlib.suppress(Exception):
-                    process.wait(0.1)
-                if process.poll() is not None and not panel.server.should_exit:
-                    lost.append(f"{name} has ended")
-                    panel.server.should_exit = True
+    def watch(name: str, process: subprocess.Popen[str]) -> None:
+        process.wait()  # without a limit of time, which would poll
+        if not panel.server.should_exit:
+            lost.append(f"{name} has ended")
+            panel.server.should_exit = True
 
-    watcher = threading.Thread(target=watch, daemon=True)
-    watcher.start()
+    for name, process in (("bench process", panel.bench), ("stop process", panel.stop)):
+        threading.Thread(target=watch, args=(name, process), daemon=True).start()
     threading.Thread(target=watch_stop, daemon=True).start()
     serve(panel.server, panel.listeners)
     panel.server.should_exit = True
-    watcher.join()
     if lost:
         raise DeviceError(
             f"The {lost[0]}, so the panel ends. Check that the bench is at 0 V, then "

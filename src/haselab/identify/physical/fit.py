@@ -27,7 +27,6 @@ from haselab.identify.physical.misstated import WrongScale, find_wrong_scale, su
 from haselab.identify.physical.plausible import find_implausible, motion_before_drive
 from haselab.identify.physical.record import MotionRecord
 from haselab.identify.physical.residuals import (
-    CONTRADICTED,
     channel_of,
     channel_residuals,
     rms_of,
@@ -106,7 +105,7 @@ def fit_actuator(
         fit = fit_from(added_inertia_kg)
     else:
         fit = fit_from(_USUAL_INERTIA * mass_kg)
-        if fit.status.startswith(CONTRADICTED):
+        if fit.contradicted:
             others = (fit_from(share * mass_kg) for share in _LARGE_INERTIAS)
             fit = _with_large_inertia(fit, others, mass_kg)
     if not fit.succeeded:
@@ -185,8 +184,8 @@ def _fit(
         found, rejected = search_with_all_effects(plain, start.without((CAMERA_SCALE,)), found)
     if not (found.converged or rejected):
         found, fault = _judge_early(plain, start.without((CAMERA_SCALE,)), found)
-        if fault:
-            return ActuatorFit(status=fault, kind=law.kind, evaluations=found.evaluations)
+        if fault is not None:
+            return replace(fault, kind=law.kind, evaluations=found.evaluations)
     lacking = start
     if rejected:
         start = start.with_law(found.unknowns.present_law(), found.unknowns.drifts)
@@ -300,7 +299,9 @@ def _explains(misfit: Misfit, before: SearchResult, after: SearchResult) -> bool
     return seen.explained or left < (1.0 - _EXPLAINS) * seen.excess_energy
 
 
-def _judge_early(misfit: Misfit, start: Unknowns, found: SearchResult) -> tuple[SearchResult, str]:
+def _judge_early(
+    misfit: Misfit, start: Unknowns, found: SearchResult
+) -> tuple[SearchResult, ActuatorFit | None]:
     """Judge records for which no search converged, before further ones that take minutes.
 
     Args:
@@ -308,8 +309,8 @@ def _judge_early(misfit: Misfit, start: Unknowns, found: SearchResult) -> tuple[
         start: where the user began.
         found: by the searches.
     Returns:
-        The best result, which may start from what explains one of the records alone, and the reason
-        why the records contradict the model or each other; empty if that is not certain.
+        The best result, which may start from what explains one of the records alone, and the fit
+        that says why the records contradict the model or each other; None if that is not certain.
     """
     alone = _each_alone(misfit, start) if len(misfit.records) > 1 else []
     if alone:
@@ -319,9 +320,11 @@ def _judge_early(misfit: Misfit, start: Unknowns, found: SearchResult) -> tuple[
             found = joint
     seen = channel_residuals(misfit, found)
     if alone and seen.excess[0] > _APART:
-        return found, _CONTRADICT
-    missed = not found.converged and seen.misses_a_signal
-    return found, status_of(seen, 1.0, (), converged=False)[0] if missed else ""
+        return found, ActuatorFit(status=_CONTRADICT)
+    if found.converged or not seen.misses_a_signal:
+        return found, None
+    status, _ = status_of(seen, 1.0, (), converged=False)
+    return found, ActuatorFit(status=status, contradicted=True)
 
 
 def _each_alone(misfit: Misfit, start: Unknowns) -> list[SearchResult]:

@@ -17,7 +17,6 @@ from haselab.identify.physical.rivals import Rival
 from haselab.identify.physical.search import SearchResult
 
 __all__ = [
-    "CONTRADICTED",
     "ChannelResiduals",
     "channel_of",
     "channel_residuals",
@@ -30,7 +29,6 @@ __all__ = [
 ]
 
 Floats = NDArray[np.float64]
-CONTRADICTED = "the records contradict the model"  # first words of the status
 _SLIGHT, _GROSS = 1.05, 10.0  # rms over noise: of a model error, and of a contradiction
 _SCALE = 0.2  # largest error of the capacitance that a calibration can have
 _LEAST_SHARE = 0.75  # of the variance of each channel that a model must explain
@@ -105,6 +103,11 @@ class ChannelResiduals:
         """Whether the law leaves much of the variance of a channel, and not only noise."""
         return not self.explained and self.share < _LEAST_SHARE
 
+    @property
+    def contradicts(self) -> bool:
+        """Whether the records contradict the law, so that there is no result."""
+        return self.excess[0] > _GROSS or self.misses_a_signal
+
 
 def channel_residuals(misfit: Misfit, found: SearchResult) -> ChannelResiduals:
     """Residuals of a search."""
@@ -133,14 +136,14 @@ def status_of(
     ratio, largest = seen.excess
     if ratio > _GROSS:
         return (
-            f"{CONTRADICTED}: its {largest} are off by {ratio:.3g} times the "
+            f"the records contradict the model: its {largest} are off by {ratio:.3g} times the "
             "noise. Check the mass, the units, that each table begins at rest under its first "
             "voltage and that all records are of one actuator, or start nearer, by "
             "[actuator.parameters]"
         ), False
     if seen.misses_a_signal:
         return (
-            f"{CONTRADICTED}: it explains only {100.0 * max(seen.share, 0.0):.0f}"
+            f"the records contradict the model: it explains only {100.0 * max(seen.share, 0.0):.0f}"
             " % of the variance of a signal. Check the mass, the amplifier's gain, the units, that "
             "each table begins at rest under its first voltage and that all records are of one "
             "actuator, or start nearer, by [actuator.parameters]"

@@ -103,6 +103,7 @@ class ActuatorFit(Fit):
         rejected_laws: those that the records contradict decisively.
         determined_by: by parameter, the segments that determine it; none if it is not identifiable.
         excess_variance: typical variance of the parameters over that with white residuals.
+        contradicted: the records contradict the law, so that there is no result.
     """
 
     law: ActuatorLaw | None = None
@@ -128,6 +129,7 @@ class ActuatorFit(Fit):
     rejected_laws: tuple[Rival, ...] = ()
     determined_by: Mapping[str, tuple[Source, ...]] = field(default_factory=dict)
     excess_variance: float = 1.0
+    contradicted: bool = False
 
     @property
     def succeeded(self) -> bool:
@@ -246,7 +248,12 @@ def result_of(
         scale = 1.0  # poorly determined, as by one voltage and one load: no contradiction
     status, usable = status_of(seen, scale, preferred, converged=found.converged)
     if not usable:
-        return ActuatorFit(status=status, kind=unknowns.law.kind, evaluations=found.evaluations)
+        return ActuatorFit(
+            status=status,
+            kind=unknowns.law.kind,
+            evaluations=found.evaluations,
+            contradicted=seen.contradicts,
+        )
     white = covariance_of([found.jacobian, np.diag(np.sqrt(prior))])
     energy = seen.excess_energy if status != "ok" else 0.0
     if scaled is not None:

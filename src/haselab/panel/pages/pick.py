@@ -217,7 +217,15 @@ def _find_dots(path: Path, stamp: tuple[int, int], number: int) -> tuple[Points,
 
 def _dots(path: Path, stamp: tuple[int, int], number: int) -> tuple[Points, DotProfile]:
     """The same, searched once for each frame."""
-    return _SEARCHES.result((path, stamp, number), lambda: _find_dots(path, stamp, number))
+    return _SEARCHES.result(*_dots_search(path, stamp, number))
+
+
+def _dots_search(
+    path: Path, stamp: tuple[int, int], number: int
+) -> tuple[Hashable, Callable[[], tuple[Points, DotProfile]]]:
+    """Key and search of the dots of a frame, for `_SEARCHES`."""
+    key = (path, stamp, number)
+    return key, lambda: _find_dots(*key)
 
 
 def _large_dot(
@@ -262,7 +270,7 @@ def _picture(videos: Videos, values: JsonObject) -> JsonObject:
     name, path, stamp, number = _of(videos, values)
     frame, count, time_s = _frame(path, stamp, number)
     if videos.only is not None and number == 0:  # the user will pick points in this frame
-        _SEARCHES.begin((path, stamp, number), lambda: _find_dots(path, stamp, number))
+        _SEARCHES.begin(*_dots_search(path, stamp, number))
     low, high = grey_range(frame)
     grey = np.clip((frame - low) * (255.0 / (high - low)), 0, 255).astype(np.uint8)
     buffer = io.BytesIO()

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import replace
 from itertools import pairwise
 
@@ -15,7 +16,8 @@ from haselab.controllers.linear_loop import UNSTABLE, Demands, LinearLoop, penal
 from haselab.scoreboard import CLASSES
 from haselab.scoreboard.devices import find_device
 from haselab.scoreboard.knowledge import true_actuator
-from haselab.scoreboard.play import setting_for
+from haselab.scoreboard.play import Scenario, play, setting_for
+from haselab.scoreboard.tasks.task import staircase
 
 HZ, HOST = find_device("hz"), CLASSES["host-100hz"]
 ONE = np.ones(1)
@@ -41,6 +43,25 @@ def test_the_penalty_rises_with_what_is_missed_however_much_it_is():
              (4.0, 3.0, 1.0, 0.1, 1e-2, 1e-4)]  # fmt: skip
     assert found[0] == 1.0
     assert all(a < b < UNSTABLE for a, b in pairwise(found))
+
+
+@pytest.mark.long
+def test_a_change_of_the_load_vanishes_on_a_pouch_too():
+    """The pull of a pouch changes with the voltage. 10 % more load for 1 s, with fixed gains."""
+    device = find_device("peano-hasel")
+    actuator = true_actuator(device)
+    low, high = actuator.reachable()
+    strain = low + 0.5 * (high - low)
+    loads = ((-math.inf, actuator.mass_kg), (1.0, 1.1 * actuator.mass_kg))
+    held = staircase(((-math.inf, strain),))
+    scenario = Scenario(device, actuator.zero_length_m, 2.0, held, loads=loads)
+    gains = {"kp": 33.8, "ki": 462.0, "kd": 0.23, "filter_s": 0.012, "reference_s": 0.0129}
+    chosen = CONTROLLERS.find("force").choose(gains)
+    trace = play(scenario, chosen, HOST, actuator, np.random.default_rng(1))
+    assert trace.failure == ""
+    error = np.abs(trace.strain - strain)
+    largest = error[(trace.time_s > 1.0) & (trace.time_s < 1.2)].max()
+    assert error[trace.time_s > 1.8].max() < 0.1 * largest
 
 
 def test_demands_that_no_gains_keep_are_refused_with_the_one_that_is_missed():

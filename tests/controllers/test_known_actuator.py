@@ -28,6 +28,7 @@ LONGEST_M = 0.08
 # kind, hung mass, length at strain 0, highest drive at a gain of 5000
 KINDS = [("planar-hasel", 0.25, 0.051, 2.0), ("peano-hasel", 0.2, 0.115, 1.4),
          ("dea-stack", 0.1, 0.036, 1.0)]  # fmt: skip
+ALL_KINDS = [*KINDS, ("curling-hasel", 0.05, 0.104, 1.6)]
 
 
 def known(kind: str = "planar-hasel", mass_kg: float = 0.25, zero_m: float = 0.051,
@@ -62,6 +63,39 @@ def test_the_sensed_length_inverts_the_law_s_capacitance(setting):
         pull_n = float(actuator.law.electric_force_n(length_m, volt))
         assert actuator.pull_n(length_m, drive_v) == pytest.approx(pull_n, rel=2e-3)
         assert actuator.drive_v(length_m, pull_n) == pytest.approx(drive_v, rel=2e-3)
+
+
+@pytest.mark.parametrize("setting", ALL_KINDS, ids=[row[0] for row in ALL_KINDS])
+def test_drive_and_force_are_inverse_to_each_other(setting):
+    """Up to rounding: a controller takes a difference for a limit that acts."""
+    actuator, rng = known(*setting, carrier_v2=5e3), np.random.default_rng(1)
+    low, high = actuator.reachable()
+    for _ in range(300):
+        length_m = actuator.length_m(rng.uniform(low, high))
+        drive_v = rng.uniform(0.05, setting[3])
+        pull_n = actuator.pull_n(length_m, drive_v)
+        assert actuator.drive_v(length_m, pull_n) == pytest.approx(drive_v, rel=1e-9)
+
+
+@pytest.mark.parametrize("setting", ALL_KINDS, ids=[row[0] for row in ALL_KINDS])
+def test_the_noise_of_a_sensed_length_is_that_at_the_drive_that_holds_it(setting):
+    """Against the sensed length of a capacitance that is off by its noise."""
+    noise_f = 1e-12
+    actuator = known(*setting, capacitance_noise_f=noise_f, sensing_scale=1.02)
+    low, high = actuator.reachable()
+    for share in (0.15, 0.4, 0.6, 0.85):
+        strain = low + share * (high - low)
+        drive_v = actuator.static_drive_v(strain)
+        farad = 1.02 * actuator.static_capacitance_f(strain)
+        ends = [actuator.sensed_length_m(farad + k * noise_f, drive_v) for k in (1, -1)]
+        assert actuator.length_noise_m(strain) == pytest.approx(abs(ends[0] - ends[1]) / 2, rel=0.1)
+
+
+def test_no_noise_makes_the_sensed_length_less_certain_than_any_length_of_the_law():
+    actuator = known(*KINDS[1], capacitance_noise_f=1e-3)
+    last = actuator.table.elastic_n.size - 1
+    any_m = last * actuator.table.step_m / math.sqrt(12.0)
+    assert actuator.length_noise_m(-0.02) == pytest.approx(any_m, rel=1e-9)
 
 
 def test_the_reachable_range_ends_at_the_drive_the_field_or_the_pull_in():

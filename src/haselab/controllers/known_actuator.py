@@ -39,6 +39,7 @@ __all__ = ["KnownActuator", "known_actuator"]
 Floats = NDArray[np.float64]
 _USUAL_GAIN = 5000.0
 _FAR = 3.0  # widths of the reachable range: farther, no load moves it
+_NEWTON_STEPS = 8  # each doubles the correct digits
 _USUAL_NOISE = 2e-4  # strain, where it is not known
 _BENCH = ("camera.", "sensing.", "start.")  # parameters of a fit that are none of the law
 
@@ -110,13 +111,27 @@ class KnownActuator:
         found = [float(np.interp(farad, rows[k], lengths_m)) for k in (row, row + 1)]
         return found[0] + share * (found[1] - found[0])
 
+    def static_capacitance_f(self, strain: float) -> float:
+        """Capacitance while a strain is held for long, in F, without the error of sensing."""
+        drive_v = min(self.static_drive_v(strain), max(self.high_v, -self.low_v))
+        return float(self.law.capacitance_f(self.length_m(strain), self.gain_v_per_v * drive_v))
+
     def length_noise_m(self, strain: float) -> float:
-        """Standard deviation of a sensed length; 0.02 % of it where the noise is not known."""
+        """Standard deviation of a sensed length while its strain is held for long.
+
+        It is 0.02 % of the length at strain 0 where the noise of the capacitance is not known, and
+        at most that of any length that the law has.
+        """
+        if math.isnan(self.capacitance_noise_f):
+            return _USUAL_NOISE * self.zero_length_m
+        drive_v = min(self.static_drive_v(strain), max(self.high_v, -self.low_v))
         length_m, step_m = self.length_m(strain), self.table.step_m
-        ends = self.law.capacitance_f(np.array([length_m - step_m, length_m + step_m]))
-        per_m = abs(float(ends[1] - ends[0])) / (2.0 * step_m) * self.sensing_scale
-        noise_f = self.capacitance_noise_f
-        return _USUAL_NOISE * self.zero_length_m if math.isnan(noise_f) else noise_f / per_m
+        near = np.array([length_m - step_m, length_m + step_m])
+        ends = self.law.capacitance_f(near, self.gain_v_per_v * drive_v)
+        change_f = abs(float(ends[1] - ends[0])) * self.sensing_scale
+        any_m = float(self._lengths_m[-1] - self._lengths_m[0]) / math.sqrt(12.0)
+        noise = 2.0 * step_m * self.capacitance_noise_f
+        return any_m if noise >= any_m * change_f else noise / change_f
 
     # ---- forces ------------------------------------------------------------------------------
 
@@ -161,7 +176,32 @@ class KnownActuator:
         forces = per_v2 * (volts * volts + self.carrier_v2)
         step = 1 if forces[-1] > forces[0] else -1
         volt = float(np.interp(pull_n, forces[::step], volts[::step]))
+        if forces.min() < pull_n < forces.max():
+            volt = self._exact_v(volt, pull_n, per_v2)
         return volt / self.gain_v_per_v
+
+    def _exact_v(self, volt: float, pull_n: float, per_v2: Floats) -> float:
+        """Voltage for which `pull_n` gives this force, by Newton from one between the same rows.
+
+        Args:
+            volt: where to start.
+            pull_n: wanted, in N.
+            per_v2: force over the mean square of the voltage, in N/V^2, one for each row.
+        """
+        step_v = self.table.step_v
+        row = min(int(volt / step_v), per_v2.size - 2)
+        slope = float(per_v2[row + 1] - per_v2[row]) / step_v
+        for _ in range(_NEWTON_STEPS):
+            square = volt * volt + self.carrier_v2
+            per = float(per_v2[row]) + slope * (volt - row * step_v)
+            steep = slope * square + 2.0 * per * volt
+            if steep == 0.0:
+                break
+            nearer = volt - (per * square - pull_n) / steep
+            volt, before = min(max(nearer, row * step_v), (row + 1) * step_v), volt
+            if abs(volt - before) <= 1e-12 * step_v:
+                break
+        return volt
 
     def highest_drive_v(self, length_m: float) -> float:
         """Highest drive at a length: that of the limits, or of the highest field, in V."""

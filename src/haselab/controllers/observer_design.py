@@ -41,6 +41,7 @@ _FREE = -math.inf, math.inf
 _POINTS = (0.1, 0.5, 0.9)  # of the reachable range
 # stiffness; longer delay, of the stated one; peak sensitivity
 _SPREAD = ((1.1, 0.0, 2.5), (0.9, 0.2, 2.5), (1.0, 0.5, 5.0))
+_SPEEDS = (0.1, 0.3, 0.8)  # of the delay: bandwidths from which the search starts
 _SHAKEN = 0.04  # of the highest drive, by noise
 _COUNTED_S = 0.5  # after a change of the load
 _CHANGED = 1.0  # of the highest change of the drive in one update, by noise
@@ -125,9 +126,13 @@ def best_parameters(
             total += factor * timed_error(loop, setting.period_s, _COUNTED_S)
         return total
 
-    start = np.log([0.1 / delay_s, 0.1 * known.mass_kg * GRAVITY_M_S2])
-    found = minimize(cost, start, method="Nelder-Mead",
-                     options={"maxfev": evaluations, "xatol": 0.02, "fatol": 1e-9})  # fmt: skip
+    load_n = 0.1 * known.mass_kg * GRAVITY_M_S2
+    slow, *fast = [np.log([speed / delay_s, load_n]) for speed in _SPEEDS]
+    options = {"maxfev": evaluations, "xatol": 0.02, "fatol": 1e-9}
+    found = minimize(cost, slow, method="Nelder-Mead", options=options)
+    faster_cost, faster = min((cost(one), one.tolist()) for one in fast)
+    if faster_cost < found.fun:  # the search was caught in a local minimum
+        found = minimize(cost, faster, method="Nelder-Mead", options=options)
     if found.fun > UNSTABLE:
         raise ResultError(
             f"No gains of the observer are stable with a delay of {setting.delay_s or 0.0:g} s. "

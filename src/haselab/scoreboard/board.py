@@ -143,8 +143,8 @@ def known_in_class(known: KnownActuator, device: Device, loop: LoopClass) -> Kno
     """
     if loop.true_states:
         known = true_actuator(device)
-    zero_f = float(known.law.capacitance_f(known.zero_length_m))
-    return replace(known, capacitance_noise_f=noise_of(loop, device.config, zero_f))
+    noise_f = noise_of(loop, device.config, known.static_capacitance_f(0.0))
+    return replace(known, capacitance_noise_f=noise_f)
 
 
 # ---- jobs of the processes -----------------------------------------------------------------------

@@ -110,7 +110,7 @@ def setting_for(
         low, high = known.reachable()
         start = 0.0
     if loop.relative_noise is not None:
-        farad = known.sensing_scale * float(known.law.capacitance_f(known.zero_length_m))
+        farad = known.sensing_scale * known.static_capacitance_f(0.0)
         known = replace(known, capacitance_noise_f=loop.relative_noise * farad)
     rate = loop.slew_of(chosen.kind) if chosen.kind.output == "voltage" else math.inf
     return ControllerSetting(

@@ -63,7 +63,7 @@ def test_without_a_frequency_response_the_model_is_drawn_alone() -> None:
 
 
 def test_a_long_record_has_points_too() -> None:
-    """More than 20,000 samples: averaged segments, whose bias at the resonance is a few per cent."""
+    """More than 20,000 samples: averaged segments, with a bias of a few per cent at the peak."""
     points = _bode(fit_transfer(_played(3, samples=24000)))[0].curves[0]
     assert points.label == "measured" and points.x.size > 50
     strong = (points.x > 0.1) & (points.x < 4.0)

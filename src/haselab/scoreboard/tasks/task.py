@@ -81,8 +81,7 @@ def sensed_noise(known: KnownActuator, scenario: Scenario, loop: LoopClass, stra
         loop: class.
         strain: at which it is measured.
     """
-    farad = float(known.law.capacitance_f(known.length_m(strain)))
-    noise_f = relative_noise_of(loop, scenario.device) * farad
+    noise_f = relative_noise_of(loop, scenario.device) * known.static_capacitance_f(strain)
     return replace(known, capacitance_noise_f=noise_f).length_noise_m(strain) / known.zero_length_m
 
 

@@ -230,6 +230,17 @@ OutVector autocovariance(const std::vector<Vector> &residuals, int lags) {
     return given(total);
 }
 
+// `before` and a signal that follows `wanted` from there, by at most `most` in each step.
+OutVector follow_slowly(Vector wanted, double before, double most) {
+    Numbers out(wanted.size() + 1);
+    double now = out[0] = before;
+    for (size_t k = 0; k < wanted.size(); ++k) {
+        now += std::min(std::max(wanted(k) - now, -most), most);
+        out[k + 1] = now;
+    }
+    return given(out);
+}
+
 std::tuple<OutVector, double> autoregression(const Numbers &covariance, int64_t count) {
     if (covariance.empty() || covariance.size() > 65) throw std::invalid_argument("lags");
     Numbers polynomial(covariance.size());
@@ -300,5 +311,6 @@ NB_MODULE(_identify, m) {
     m.def("oscillate", &oscillate, nb::arg("u"), nb::arg("input_rate_hz"), nb::arg("before"),
           nb::arg("first_order"), nb::arg("time_s"), nb::arg("numbers"), nb::arg("largest"));
     m.def("autocovariance", &autocovariance, nb::arg("residuals"), nb::arg("lags"));
+    m.def("follow_slowly", &follow_slowly, nb::arg("wanted"), nb::arg("before"), nb::arg("most"));
     m.def("autoregression", &autoregression, nb::arg("covariance"), nb::arg("count"));
 }

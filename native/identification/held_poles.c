@@ -8,6 +8,7 @@
 
 #define SNAP 1e-9 /* of a period: an output this short before an edge counts as on it */
 #define SERIES 0.25
+#define NOTHING 1e-140 /* a state that has decayed so far is 0: numbers near the smallest are slow */
 
 /* What a stretch of r seconds does: decay, and the push of a constant and of a ramp, each with its
  * derivative by the pole. */
@@ -22,25 +23,44 @@ static held_complex plain(double complex z)
     return out;
 }
 
+/* 1/n! */
+static const double INVERSE[15] = {1.0,
+                                   1.0,
+                                   1.0 / 2.0,
+                                   1.0 / 6.0,
+                                   1.0 / 24.0,
+                                   1.0 / 120.0,
+                                   1.0 / 720.0,
+                                   1.0 / 5040.0,
+                                   1.0 / 40320.0,
+                                   1.0 / 362880.0,
+                                   1.0 / 3628800.0,
+                                   1.0 / 39916800.0,
+                                   1.0 / 479001600.0,
+                                   1.0 / 6227020800.0,
+                                   1.0 / 87178291200.0};
+
 /* (e^z - 1)/z, (its value - 1)/z and their derivatives by z. */
 static void phi(double complex z, double complex e, double complex out[4])
 {
     if (cabs(z) < SERIES) {
-        double complex power = 1.0, sums[4] = {0.0, 0.0, 0.0, 0.0};
-        double factorial = 1.0;
-        int32_t k;
+        const double re = creal(z), im = cimag(z);
+        double power_re = 1.0, power_im = 0.0, sums[8] = {0.0};
+        int32_t k, i;
         for (k = 0; k < 12; ++k) {
-            factorial *= k + 1;
-            sums[0] += power / factorial;
-            sums[1] += power / (factorial * (k + 2));
-            sums[2] += power * (k + 1) / (factorial * (k + 2));
-            sums[3] += power * (k + 1) / (factorial * (k + 2) * (k + 3));
-            power *= z;
+            const double weights[4] = {INVERSE[k + 1], INVERSE[k + 2], (k + 1) * INVERSE[k + 2],
+                                       (k + 1) * INVERSE[k + 3]};
+            const double old = power_re;
+            for (i = 0; i < 4; ++i) {
+                sums[i] += weights[i] * power_re;
+                sums[4 + i] += weights[i] * power_im;
+            }
+            power_re = power_re * re - power_im * im;
+            power_im = power_im * re + old * im;
         }
-        out[0] = sums[0];
-        out[1] = sums[1];
-        out[2] = sums[2];
-        out[3] = sums[3];
+        for (i = 0; i < 4; ++i) {
+            out[i] = sums[i] + sums[4 + i] * I;
+        }
         return;
     }
     out[0] = quotient(e - 1.0, z);
@@ -92,6 +112,8 @@ static double slope_at(const held_record *record, int32_t k)
     return (record->u[k + 1] - record->u[k]) / record->period_s;
 }
 
+static int32_t decayed(double a, double b) { return fabs(a) + fabs(b) < NOTHING; }
+
 typedef struct {
     double *re, *im, *slope_re, *slope_im, *ramp;
 } edge_states;
@@ -116,6 +138,9 @@ static void run(const held_record *record, held_complex pole, edge_states x)
         im = turned_im + (s.push.im * u + s.ramp.im * ramp);
         slope_re = moved_re + (s.r * turned_re + (s.push_slope.re * u + s.ramp_slope.re * ramp));
         slope_im = moved_im + (s.r * turned_im + (s.push_slope.im * u + s.ramp_slope.im * ramp));
+        if (decayed(re, im) && decayed(slope_re, slope_im)) {
+            re = im = slope_re = slope_im = 0.0;
+        }
     }
 }
 
@@ -191,6 +216,9 @@ void held_free(const held_record *record, held_complex pole, double *scratch, he
         powers[k].im = im;
         re = step.re * re - step.im * im;
         im = step.re * im + step.im * old;
+        if (decayed(re, im)) {
+            re = im = 0.0;
+        }
     }
     for (g = 0; g < record->n_groups; ++g) {
         parts[g] = plain(cexp(p * record->phase[g] * record->period_s));

@@ -2,8 +2,13 @@
 
 #include <math.h>
 
+#ifndef HS_CLONES
+#define HS_CLONES
+#endif
+
 #define N OSCILLATOR_NUMBERS
 #define STEP 0.12 /* of a radian of the fastest motion: relative error of its frequency 2e-6 */
+#define NOTHING 1e-140 /* numbers near the smallest are slow */
 
 typedef struct {
     double x, v;
@@ -73,6 +78,7 @@ static void piece(const oscillator_record *r, int64_t edge, double *u, double *s
     *slope = r->first_order && edge >= 0 ? (edge_value(r, edge + 1) - *u) / r->period_s : 0.0;
 }
 
+HS_CLONES
 int32_t oscillator_simulate(const oscillator_record *record, const double *numbers, double largest,
                             double *x, double *by_number) {
     const double omega = exp(numbers[OSCILLATOR_LOG_OMEGA]);
@@ -118,7 +124,10 @@ int32_t oscillator_simulate(const oscillator_record *record, const double *numbe
             }
         }
         x[m] = s.x;
-        for (int k = 0; k < N; ++k) by_number[(int64_t)k * record->n + m] = s.dx[k];
+        for (int k = 0; k < N; ++k) {
+            if (fabs(s.dx[k]) + fabs(s.dv[k]) < NOTHING) s.dx[k] = s.dv[k] = 0.0;
+            by_number[(int64_t)k * record->n + m] = s.dx[k];
+        }
     }
     return 1;
 }

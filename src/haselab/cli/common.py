@@ -7,7 +7,8 @@ import json
 import math
 import os
 import sys
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterator, Mapping
+from contextlib import contextmanager
 from dataclasses import replace
 from pathlib import Path
 from typing import Any, TypeVar
@@ -34,6 +35,7 @@ __all__ = [
     "emit",
     "progress_bar",
     "unverified_option",
+    "waiting",
     "warn_unverified",
 ]
 
@@ -174,23 +176,29 @@ def emit(
 
 
 class _BarProgress:
-    """A rich progress bar on stderr."""
+    """A rich progress bar on stderr; of a step of unknown length, the time that it has taken."""
 
-    def __init__(self) -> None:
+    def __init__(self, waits_for: str | None = None) -> None:
         from rich.console import Console
         from rich.progress import BarColumn, TextColumn, TimeElapsedColumn, TimeRemainingColumn
         from rich.progress import Progress as RichProgress
 
+        share = [TextColumn("{task.percentage:3.0f} %")] if waits_for is None else []
+        left = [TimeRemainingColumn()] if waits_for is None else []
         self._bar = RichProgress(
             TextColumn("{task.description:40.40s}"),
             BarColumn(),
-            TextColumn("{task.percentage:3.0f} %"),
+            *share,
             TimeElapsedColumn(),
-            TimeRemainingColumn(),
+            *left,
             console=Console(stderr=True),
             transient=True,
         )
-        self._task = self._bar.add_task("", total=None)
+        self._task = self._bar.add_task(waits_for or "", total=None)
+
+    def wait(self) -> None:
+        """Show the bar until `stop`."""
+        self._bar.start()
 
     def start(self, total: float) -> None:
         """Show the bar for a job of `total` units."""
@@ -214,5 +222,26 @@ def progress_bar() -> Progress:
     Commands after ! in a notebook also get a terminal, but the notebook shows each state of the bar
     as a separate line. Jupyter sets JPY_PARENT_PID in each kernel.
     """
-    seen = sys.stderr.isatty() and "JPY_PARENT_PID" not in os.environ
-    return _BarProgress() if seen else SilentProgress()
+    return _BarProgress() if _is_watched() else SilentProgress()
+
+
+def _is_watched() -> bool:
+    return sys.stderr.isatty() and "JPY_PARENT_PID" not in os.environ
+
+
+@contextmanager
+def waiting(what: str) -> Iterator[None]:
+    """Show that a step of unknown length goes on, where `progress_bar` shows a bar.
+
+    Args:
+        what: names the step.
+    """
+    if not _is_watched():
+        yield
+        return
+    bar = _BarProgress(what)
+    bar.wait()
+    try:
+        yield
+    finally:
+        bar.stop()

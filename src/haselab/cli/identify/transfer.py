@@ -13,7 +13,7 @@ import numpy as np
 from haselab.base import InputError
 from haselab.cli.actuator_file import load_actuator, save_section
 from haselab.cli.columns import column_options
-from haselab.cli.common import INTEGER, REAL, SEED, actuator_option, answer_options
+from haselab.cli.common import INTEGER, REAL, SEED, actuator_option, answer_options, waiting
 from haselab.cli.identify.common import (
     FILES,
     INPUT,
@@ -172,6 +172,7 @@ def transfer(
             origins += [file] * len(found_records.records)
             units = _agreed(units, found_records.units, (source, output))
     refuse_copies(origins, [record.y for record in records])
+    outputs = sum(record.y.size for record in records)
     found: TransferFit | TransferChoice
     fit: TransferFit
     if options["nonlinear"] and options["choose"]:
@@ -181,7 +182,7 @@ def transfer(
         )
     if options["nonlinear"] and options["bootstrap"] is not None:
         raise InputError("--bootstrap needs a linear model. Leave out --bootstrap or --nonlinear.")
-    with name_files_in_errors(*files):
+    with name_files_in_errors(*files), waiting(f"fit {outputs:,} outputs"):
         if options["nonlinear"]:
             found = fit = fit_nonlinear(records, structure, options["nonlinear"])
         elif options["choose"]:

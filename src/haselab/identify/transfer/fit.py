@@ -21,7 +21,7 @@ from haselab.identify.record import Record, finite_vector, record_notes
 from haselab.identify.residual_tests import input_correlation_p
 from haselab.identify.transfer.bode import bode_panels
 from haselab.identify.transfer.checks.ambiguity import OtherMinimum, ambiguity, find_other_minima
-from haselab.identify.transfer.checks.diagnosis import diagnose
+from haselab.identify.transfer.checks.diagnosis import Diagnosis, diagnose
 from haselab.identify.transfer.checks.preconditions import (
     check_size,
     count_outputs,
@@ -53,6 +53,8 @@ Floats = NDArray[np.float64]
 _HELD_OUT = 0.25
 _FILTERED = 1e-3  # of the output: noise that is far above the errors of a filtered record
 _SWAPPED = 50.0  # per cent of fit with the columns swapped
+_RULED_OUT = 4.0  # times the least cost, at a lower rate: no minimum to be listed
+_SAME = 1e-3  # relative difference of two solutions that are one
 _LITTLE = 30.0  # per cent of fit
 _RELATED = 1e-3
 _UNEXPLAINED = (
@@ -354,10 +356,11 @@ def _fitted(
     near: TransferFit | None,
 ) -> TransferFit:
     """Fit the records; if the result is in doubt, test other explanations of them."""
-    tones = too_few_tones(layout_of(structure), at_lower_rate(records, structure.poles) or records)
+    slower = at_lower_rate(records, structure.poles)
+    tones = too_few_tones(layout_of(structure), slower or records)
     if tones is not None:
         return _no_result(layout_of(structure), tones)
-    fit = _fit(layout_of(structure), records, applied=applied, near=near)
+    fit = _fit(layout_of(structure), records, slower, applied=applied, near=near)
     if _doubtful(fit):
         why = _why(structure, records)
         fit = fit if why is None else replace(fit, status=why, ambiguous=False)
@@ -369,17 +372,26 @@ def _fitted(
     if fit.succeeded or not (structure.initial_state and alone):
         return fit
     # One step at t = 0 looks like a free decay from another state, so rest has to be assumed.
-    fit = _fit(layout_of(replace(structure, initial_state=False)), records, applied=applied)
+    at_rest = layout_of(replace(structure, initial_state=False))
+    fit = _fit(at_rest, records, slower, applied=applied)
     return replace(fit, notes=(*fit.notes, _RESTING))
 
 
 def _fit(
-    layout: Layout, records: Sequence[Record], *, applied: bool, near: TransferFit | None = None
+    layout: Layout,
+    records: Sequence[Record],
+    slower: Sequence[Record] | None,
+    *,
+    applied: bool,
+    near: TransferFit | None = None,
 ) -> TransferFit:
-    """Search the parameters, from a near fit if there is one, then describe the result."""
+    """Search the parameters, from a near fit if there is one, then describe the result.
+
+    `slower` are the records at a lower rate, if they can be filtered.
+    """
     check_size(layout, records)
     known = [] if near is None or near.best is None else [near.best.found.search]
-    slower = None if known else at_lower_rate(records, layout.structure.poles)
+    slower = None if known else slower
     best = _search(layout, records if slower is None else slower, known)
     if best is None:
         return _no_result(layout, "no stable model found; record longer, or fit fewer poles")
@@ -415,16 +427,15 @@ def _describe_all(
 ) -> TransferFit:
     """Describe a fit to all outputs, which starts at the solution for a lower rate.
 
-    Spikes, clipping and wrong times are searched for at the lower rate; only if something is found,
-    in all outputs, too.
+    Spikes, clipping and wrong times are searched for at the lower rate; what is found there, in all
+    outputs, too.
     """
     found = diagnose(layout, best, applied=applied)
-    starts = [one.search for one in (best.found, *best.others)]
-    whole = _search(layout, records, starts)
+    whole = _search(layout, records, _worth_a_search(best))
     if whole is None:
         return _no_result(layout, "no stable model found; record longer, or fit fewer poles")
-    if found.fault is not None or found.notes:
-        found = diagnose(layout, whole, applied=applied)
+    if found.cause is not None or found.notes:
+        found = _confirmed(layout, whole, found.cause, applied=applied)
         whole = found.best
     noise = math.sqrt(best.found.cost / count_outputs(best.records))
     if noise > _FILTERED * max(float(np.std(record.y)) for record in best.records):
@@ -434,6 +445,24 @@ def _describe_all(
     if found.fault is not None:
         fit = replace(fit, status=found.fault, ambiguous=False)
     return replace(fit, notes=(*fit.notes, *found.notes))
+
+
+def _confirmed(layout: Layout, best: Best, cause: str | None, *, applied: bool) -> Diagnosis:
+    """What explains the residuals of all outputs: first what was found at a lower rate."""
+    if cause is None:  # spikes alone
+        return diagnose(layout, best, applied=applied, causes=())
+    found = diagnose(layout, best, applied=applied, causes=[cause])
+    return diagnose(layout, best, applied=applied) if found.cause is None else found
+
+
+def _worth_a_search(best: Best) -> list[Floats]:
+    """The solution and others that differ from it and may be nearly as likely."""
+    kept: list[Floats] = []
+    for one in (best.found, *best.others):
+        new = not any(np.allclose(one.search, other, _SAME, 1e-6) for other in kept)
+        if new and one.cost <= _RULED_OUT * best.found.cost:
+            kept.append(one.search)
+    return kept
 
 
 def _is_fed_back(fit: TransferFit) -> bool:
@@ -459,7 +488,9 @@ def _why(structure: TransferStructure, records: Sequence[Record]) -> str | None:
         )
     if all(record.u.size == record.y.size and np.ptp(record.u) > 0.0 for record in records):
         turned = [Record.sampled(r.y, r.u, r.input_rate_hz) for r in records]
-        backwards = _fit(layout_of(replace(structure, delay=0.0, fixed={})), turned, applied=True)
+        backwards_layout = layout_of(replace(structure, delay=0.0, fixed={}))
+        slower = at_lower_rate(turned, structure.poles)
+        backwards = _fit(backwards_layout, turned, slower, applied=True)
         if backwards.succeeded and backwards.fit_percent > _SWAPPED:
             return "no result: the input responds to the output; the columns are swapped"
     return None

@@ -67,8 +67,9 @@ def _every(record: Record, share: float) -> int:
     part = record.y.size // _PARTS
     frequency_hz, power = welch(record.y, rate_hz, nperseg=part, detrend="linear")
     noise = float(np.median(power[power.size // 2 :]))
-    left = np.cumsum(power[::-1])[::-1]  # in this and all higher frequencies
-    moves = (power > _ABOVE_NOISE * noise) & (left > share * left[0])
+    clear = np.where(power > _ABOVE_NOISE * noise, power, 0.0)
+    left = np.cumsum(clear[::-1])[::-1]  # in this and all higher frequencies, without the noise
+    moves = (clear > 0.0) & (left > share * left[0])
     highest_hz = float(frequency_hz[np.flatnonzero(moves)[-1]]) if moves.any() else 0.0
     wanted_hz = _FINER * max(highest_hz, float(frequency_hz[1]))
     fewest = record.y.size // (4 * _REACH)

@@ -12,13 +12,15 @@ from scipy.special import ndtri
 from haselab.base import InputError
 from haselab.identify.record import Record
 from haselab.identify.transfer.checks.clipping import clipped_input, keep_outputs, without_clipped
-from haselab.identify.transfer.checks.timing import timing_cause
+from haselab.identify.transfer.checks.timing import KINDS, timing_cause
 from haselab.identify.transfer.layout import Layout
 from haselab.identify.transfer.search import Best, best_fit
 
-__all__ = ["Diagnosis", "diagnose"]
+__all__ = ["CAUSES", "Diagnosis", "diagnose"]
 
 Floats = NDArray[np.float64]
+_OUTPUT, _INPUT = "clipped output", "clipped input"
+CAUSES = (_OUTPUT, _INPUT, *KINDS)
 _FALSE_ALARM = 1e-3  # probability that white noise alone has a spike
 _MOST_SPIKES = 0.05  # of the outputs
 _ISOLATED = 3  # outputs in a row that a spike may take
@@ -40,50 +42,56 @@ class Diagnosis:
         best: the solution for the remaining outputs.
         notes: one sentence for each exclusion.
         fault: why the parameters are not usable, as a status; None: they are.
+        cause: the one of `CAUSES` that was found; None: none, or only spikes.
     """
 
     best: Best
     notes: tuple[str, ...] = ()
     fault: str | None = None
+    cause: str | None = None
 
 
-def diagnose(layout: Layout, best: Best, *, applied: bool) -> Diagnosis:
+def diagnose(
+    layout: Layout, best: Best, *, applied: bool, causes: Sequence[str] = CAUSES
+) -> Diagnosis:
     """The fit without spikes and clipped outputs, where these explain the records better.
 
     Args:
         layout: order of the parameters.
         best: solution for all outputs.
         applied: whether the inputs are known to have been applied as recorded, by the same clock.
+        causes: that are tested, besides spikes.
     """
     notes: list[str] = []
     if best.whiteness_p < _COLOURED or _spikes(best.columns.residuals) is not None:
         best, said = _without_spikes(layout, best)
         notes += said
     if best.whiteness_p < _COLOURED:
-        free, said = without_clipped(layout, best)
+        free, said = without_clipped(layout, best) if _OUTPUT in causes else (None, [])
         if free is not None:
-            return Diagnosis(free, (*notes, *said))
-        return Diagnosis(best, tuple(notes)) if applied else _named(layout, best, notes)
+            return Diagnosis(free, (*notes, *said), cause=_OUTPUT)
+        return Diagnosis(best, tuple(notes)) if applied else _named(layout, best, notes, causes)
     return Diagnosis(best, tuple(notes))
 
 
-def _named(layout: Layout, best: Best, notes: list[str]) -> Diagnosis:
+def _named(layout: Layout, best: Best, notes: list[str], causes: Sequence[str]) -> Diagnosis:
     """Check timing faults, a slew limit and a clipped input as the cause."""
-    clipped = clipped_input(layout, best)
-    cause = timing_cause(layout, best)
+    kinds = [kind for kind in KINDS if kind in causes]
+    clipped = clipped_input(layout, best) if _INPUT in causes else None
+    cause = timing_cause(layout, best, kinds) if kinds else None
     if clipped is not None and cause is not None:
         if _mean_square(clipped[1]) < _mean_square(cause.best):
             cause = None
         else:
             clipped = None
     if clipped is not None:
-        return Diagnosis(best, tuple(notes), clipped[0])
+        return Diagnosis(best, tuple(notes), clipped[0], _INPUT)
     if cause is None:
         return Diagnosis(best, tuple(notes))
     if cause.fault or cause.best.whiteness_p < _COLOURED:
-        return Diagnosis(best, tuple(notes), f"no result: {cause.sentence}")
+        return Diagnosis(best, tuple(notes), f"no result: {cause.sentence}", cause.kind)
     sentence = cause.sentence[0].upper() + cause.sentence[1:]
-    return Diagnosis(cause.best, (*notes, sentence))
+    return Diagnosis(cause.best, (*notes, sentence), cause=cause.kind)
 
 
 def _mean_square(best: Best) -> float:

@@ -5,11 +5,13 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, replace
+from functools import partial
 
 import numpy as np
 from numpy.typing import NDArray
 from scipy.optimize import minimize_scalar
 
+from haselab import _identify
 from haselab.base import InputError
 from haselab.identify.noise import autoregression
 from haselab.identify.record import Record
@@ -17,13 +19,14 @@ from haselab.identify.residual_tests import input_correlation_p
 from haselab.identify.transfer.checks.ambiguity import whitened_energy
 from haselab.identify.transfer.checks.clipping import keep_outputs, richer_fits
 from haselab.identify.transfer.layout import Layout
-from haselab.identify.transfer.problem import TransferProblem
+from haselab.identify.transfer.problem import Found, TransferProblem
 from haselab.identify.transfer.search import Best, best_fit
 from haselab.identify.transfer.start import delay_grid, delay_margin_s
 
-__all__ = ["Cause", "timing_cause"]
+__all__ = ["KINDS", "Cause", "timing_cause"]
 
 Floats = NDArray[np.float64]
+KINDS = ("drift", "slew", "lost outputs", "lost rows")
 # Twice the gain of logarithmic likelihood that identifies a cause, besides the search's own gain.
 _BETTER = 50.0
 _MOST_NUMBERS = 4  # searched parameters: three poles and a delay; more would take minutes
@@ -36,6 +39,10 @@ _SLEWS = 12
 _LONGEST = 0.2  # of a record: the longest time that a typical step of the input may take
 _FINER = 4  # points per sample of a slew-limited input
 _STEPS = 18  # of the search for one number
+_ROUGH = 1e-6  # of the cost: a step that gains less ends such a search
+_NUDGE = 1e-3  # of the distance of two places: to find the slope of the residuals
+_ENOUGH = 4_000  # outputs that decide where a cause is searched for
+_UNEVEN = 0.5 * (math.sqrt(5.0) - 1.0)  # golden ratio: parts of its multiples fill 0 to 1 evenly
 _PART = 0.4  # of a record, from either end, to which a model is fitted
 _MOST_LOST = 0.1  # of a record
 _MOST_SHIFTS = 400
@@ -55,16 +62,21 @@ class Cause:
         sentence: description for the user.
         places: number of places that were searched.
         fault: whether the result is unusable; else `best` is the result.
+        kind: what it is, one of `KINDS`.
     """
 
     best: Best
     sentence: str
     places: int
     fault: bool
+    kind: str
 
 
-def timing_cause(layout: Layout, best: Best) -> Cause | None:
-    """The most likely of these causes, or None when none explains the records.
+_CauseSearch = Callable[[Layout, Best, Sequence[Floats]], Cause | None]
+
+
+def timing_cause(layout: Layout, best: Best, kinds: Sequence[str] = KINDS) -> Cause | None:
+    """The most likely cause of these kinds, or None when none explains the records.
 
     It has to be more likely than the fit and than linear models with another pole or slow branch,
     by 50 in twice the logarithmic likelihood and by what the search over many places gains from
@@ -72,7 +84,7 @@ def timing_cause(layout: Layout, best: Best) -> Cause | None:
     """
     if layout.free.size > _MOST_NUMBERS:
         return None
-    causes = [cause for cause in _causes(layout, best) if _explains(cause, best)]
+    causes = [cause for cause in _causes(layout, best, kinds) if _explains(cause, best)]
     if not causes:
         return None
     count = sum(r.y.size for r in best.records)
@@ -85,14 +97,16 @@ def timing_cause(layout: Layout, best: Best) -> Cause | None:
     return chosen
 
 
-def _causes(layout: Layout, best: Best) -> Iterator[Cause]:
+def _causes(layout: Layout, best: Best, kinds: Sequence[str]) -> Iterator[Cause]:
     starts = [best.found.search]
     first = best.records[0]
     part = _part_fit(layout, first, np.arange(first.y.size) < _PART * first.y.size, starts)
     if part is not None and np.abs(part.found.search - starts[0]).max(initial=0.0) > _ELSEWHERE:
         starts.append(part.found.search)  # a part may show clearly what the whole record hides
-    for search in (_drift, _slew, _lost_outputs, _lost_rows):
-        cause = search(layout, best, starts)
+    lost_outputs = partial(_lost_outputs, first=part)
+    searches: tuple[_CauseSearch, ...] = (_drift, _slew, lost_outputs, _lost_rows)
+    for kind, search in zip(KINDS, searches, strict=True):
+        cause = search(layout, best, starts) if kind in kinds else None
         if cause is not None:
             yield cause
 
@@ -124,26 +138,90 @@ def _refit(layout: Layout, records: Sequence[Record], starts: Sequence[Floats]) 
 
 
 def _least(
-    fitted: Callable[[float], Best | None], places: Sequence[float], reach: float
+    layout: Layout,
+    best: Best,
+    changed: Callable[[Record, float], Record],
+    starts: Sequence[Floats],
+    places: Sequence[float],
+    reach: float,
 ) -> tuple[float, Best] | None:
-    """The best of some values, refined by a local search."""
-    found = [(at, fit) for at in places if (fit := fitted(at)) is not None]
-    if not found:
+    """The best value of a change of the records, of some places and then between them.
+
+    Outputs that are spread over the records decide where it is; the fit is to all of them.
+    """
+    few, margin_s = _spread_out(best.records), delay_margin_s(best.records)
+
+    def found_at(value: float, known: Sequence[Floats]) -> Found | None:
+        try:
+            records = [changed(record, value) for record in few]
+        except InputError:
+            return None
+        problem = TransferProblem(layout, records, margin_s)
+        inside = (np.clip(start, *best.bounds) for start in known)
+        found = [problem.minimise(start, best.bounds, _ROUGH) for start in inside]
+        return min(found, key=lambda one: one.cost)
+
+    def fitted(value: float, start: Floats) -> Best | None:
+        try:
+            return _refit(layout, [changed(record, value) for record in best.records], [start])
+        except InputError:
+            return None
+
+    tried = [(value, found) for value in places if (found := found_at(value, starts)) is not None]
+    if not tried:
         return None
-    at, fit = min(found, key=lambda pair: _mean_square(pair[1]))
+    at, least = min(tried, key=lambda pair: pair[1].cost)
+    low, high = at - reach, at + reach
 
     def cost(value: float) -> float:
-        other = fitted(value)
-        return math.inf if other is None else _mean_square(other)
+        nonlocal at, least
+        found = found_at(value, [least.search, *starts])
+        if found is not None and found.cost < least.cost:
+            at, least = value, found
+        return math.inf if found is None else found.cost
 
-    searched = minimize_scalar(
-        cost, bounds=(at - reach, at + reach), method="bounded",
+    minimize_scalar(
+        cost, bounds=(low, high), method="bounded",
         options={"maxiter": _STEPS, "xatol": 1e-4 * reach},
     )  # fmt: skip
-    finer = fitted(float(searched.x))
-    if finer is not None and _mean_square(finer) < _mean_square(fit):
-        return float(searched.x), finer
+    fit = fitted(at, least.search)
+    if fit is None:
+        return None
+    if few is not best.records:
+        at, fit = _stepped(fitted, at, fit, _NUDGE * reach)
     return at, fit
+
+
+def _stepped(
+    fitted: Callable[[float, Floats], Best | None], at: float, fit: Best, nudge: float
+) -> tuple[float, Best]:
+    """One step of Gauss and Newton towards the value that leaves the least residuals."""
+    other = fitted(at + nudge, fit.found.search)
+    if other is None:
+        return at, fit
+    residuals, others = (np.concatenate(one.columns.residuals) for one in (fit, other))
+    slope = (others - residuals) / nudge
+    steepness = float(slope @ slope)
+    nearer = at - float(slope @ residuals) / steepness if steepness > 0.0 else at
+    finer = fitted(nearer, fit.found.search)
+    if finer is None or not finer.found.cost < fit.found.cost:
+        return at, fit
+    return nearer, finer
+
+
+def _spread_out(records: Sequence[Record]) -> Sequence[Record]:
+    """The records with fewer outputs, at uneven distances: they see every part of a period."""
+    stride = sum(record.y.size for record in records) / _ENOUGH
+    if stride < 2.0:
+        return records
+    few = []
+    for record in records:
+        index = np.arange(int(record.y.size / stride))
+        picked = (stride * (index + index * _UNEVEN % 1.0)).astype(np.intp)
+        keep = np.zeros(record.y.size, bool)
+        keep[picked[picked < keep.size]] = True
+        few.append(record if keep.sum() < 2 * _EDGE else keep_outputs(record, keep))
+    return few
 
 
 def _motion_s(layout: Layout, records: Sequence[Record]) -> float:
@@ -168,11 +246,11 @@ def _drift(layout: Layout, best: Best, starts: Sequence[Floats]) -> Cause | None
     step = min(2.0 * 2.0 * _motion_s(layout, best.records) / longest_s, _DRIFT)
     count = min(int(_DRIFT / step), _MOST_DRIFTS)
 
-    def fitted(part: float) -> Best | None:
-        records = [replace(r, output_time_s=r.output_time_s * (1.0 + part)) for r in best.records]
-        return _refit(layout, records, starts)
+    def drifting(record: Record, part: float) -> Record:
+        return replace(record, output_time_s=record.output_time_s * (1.0 + part))
 
-    found = _least(fitted, [k * step for k in range(-count, count + 1)], step)
+    places = [k * step for k in range(-count, count + 1)]
+    found = _least(layout, best, drifting, starts, places, step)
     if found is None:
         return None
     part, fit = found
@@ -183,6 +261,7 @@ def _drift(layout: Layout, best: Best, starts: Sequence[Floats]) -> Cause | None
         "input; record both with one clock, or give the output's true times",
         2 * count + 1 + _STEPS,
         fault=True,
+        kind="drift",
     )
 
 
@@ -198,15 +277,11 @@ def _slew(layout: Layout, best: Best, starts: Sequence[Floats]) -> Cause | None:
     longest_s = _LONGEST * min(r.duration_s for r in best.records)
     places = np.log(usual / np.geomspace(shortest_s, longest_s, _SLEWS))
 
-    def fitted(logarithm: float) -> Best | None:
-        rate = math.exp(logarithm)
-        try:
-            records = [_limited(r, rate) for r in best.records]
-        except InputError:
-            return None
-        return _refit(layout, records, starts)
+    def slow(record: Record, logarithm: float) -> Record:
+        return _limited(record, math.exp(logarithm))
 
-    found = _least(fitted, places.tolist(), float(places[0] - places[1]))
+    reach = float(places[0] - places[1])
+    found = _least(layout, best, slow, starts, places.tolist(), reach)
     if found is None:
         return None
     logarithm, fit = found
@@ -217,6 +292,7 @@ def _slew(layout: Layout, best: Best, starts: Sequence[Floats]) -> Cause | None:
         "the limit",
         _SLEWS + _STEPS,
         fault=True,
+        kind="slew",
     )
 
 
@@ -228,21 +304,21 @@ def _limited(record: Record, rate: float) -> Record:
     if record.hold == "first":
         at = np.arange(fine.size) / _FINER
         fine = np.interp(at, np.arange(record.u.size), record.u)
-    now = record.input_before if record.input_before is not None else float(record.u[0])
-    out = [now]
-    for target in fine.tolist():
-        now += min(max(target - now, -most), most)
-        out.append(now)
-    return replace(
-        record, u=np.array(out), input_rate_hz=record.input_rate_hz * _FINER, hold="first"
-    )
+    before = record.input_before if record.input_before is not None else float(record.u[0])
+    applied = _identify.follow_slowly(fine, before, most)
+    return replace(record, u=applied, input_rate_hz=record.input_rate_hz * _FINER, hold="first")
 
 
-def _lost_outputs(layout: Layout, best: Best, starts: Sequence[Floats]) -> Cause | None:
-    """From some output on, all times are wrong by a whole number of samples."""
+def _lost_outputs(
+    layout: Layout, best: Best, starts: Sequence[Floats], first: Best | None
+) -> Cause | None:
+    """From some output on, all times are wrong by a whole number of samples.
+
+    `first` is the fit to the first part of the first record.
+    """
     chosen: Cause | None = None
     for i, record in enumerate(best.records):
-        for at, shift, start in _shifts(layout, record, starts):
+        for at, shift, start in _shifts(layout, record, starts, first if i == 0 else None):
             found = _moved(layout, best, i, (at, shift), [*starts, start])
             if found is None or (chosen and _mean_square(found[0]) >= _mean_square(chosen.best)):
                 continue
@@ -255,7 +331,8 @@ def _lost_outputs(layout: Layout, best: Best, starts: Sequence[Floats]) -> Cause
                 else f"from {from_s:.4g} s on the outputs are {-shift} samples late (repeated "
                 "outputs, or lost inputs); their times are corrected."
             )
-            chosen = Cause(fit, sentence, record.y.size * _MOST_SHIFTS, fault=False)
+            places = record.y.size * _MOST_SHIFTS
+            chosen = Cause(fit, sentence, places, fault=False, kind="lost outputs")
     return chosen
 
 
@@ -288,7 +365,7 @@ def _most_lost(record: Record) -> int:
 
 
 def _shifts(
-    layout: Layout, record: Record, starts: Sequence[Floats]
+    layout: Layout, record: Record, starts: Sequence[Floats], first: Best | None
 ) -> list[tuple[int, int, Floats]]:
     """Likely places and sizes of a loss, from models of the first and last part of a record.
 
@@ -304,7 +381,7 @@ def _shifts(
         pad_s = 0.0 if early or not free else _most_lost(record) * record.output_step_s
         later = [np.append(start[:-1], start[-1] + pad_s) for start in starts] if pad_s else starts
         padded = replace(record, output_time_s=record.output_time_s + pad_s)
-        fit = _part_fit(layout, padded, keep, later)
+        fit = first if early and first is not None else _part_fit(layout, padded, keep, later)
         if fit is not None:
             for total, at, shift in _places(layout, padded, fit, keep, early=early)[:_KEPT]:
                 start = fit.found.search.copy()
@@ -388,6 +465,7 @@ def _lost_rows(layout: Layout, best: Best, starts: Sequence[Floats]) -> Cause | 
                 "there.",
                 record.y.size,
                 fault=False,
+                kind="lost rows",
             )
     return chosen
 

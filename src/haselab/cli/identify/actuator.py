@@ -16,7 +16,14 @@ from haselab.actuators import ACTUATORS, ActuatorLaw, measured_parameters, with_
 from haselab.base import InputError, JsonObject, LimitError
 from haselab.cli.actuator_file import load_actuator, save_section
 from haselab.cli.columns import column_options
-from haselab.cli.common import POSITIVE, REAL, actuator_option, answer_options, unverified_option
+from haselab.cli.common import (
+    POSITIVE,
+    REAL,
+    actuator_option,
+    answer_options,
+    unverified_option,
+    waiting,
+)
 from haselab.cli.identify.common import FILES, RATE, emit_fit, refuse_copies
 from haselab.cli.identify.recorded_motion import TableOptions, motion_of_file
 from haselab.cli.options import shared_option
@@ -127,11 +134,12 @@ def actuator(
     refuse_copies(files, [record.capacitance_f for record in records])
     _warn_of_stated(files, records, gains_v_per_v, tables, actuator)
     tracked = all(file.is_dir() or is_session(file) for file in files)
-    fit = fit_actuator(
-        law, records, mass_kg=mass_kg, added_inertia_kg=added_inertia_kg,
-        camera_bias_m=zero_std_m or (TRACKED_ZERO_M if tracked else _TABLE_ZERO_M),
-        clock_std=0.0 if tracked else _TABLE_CLOCK,
-    )  # fmt: skip
+    with waiting("search for the physical model"):
+        fit = fit_actuator(
+            law, records, mass_kg=mass_kg, added_inertia_kg=added_inertia_kg,
+            camera_bias_m=zero_std_m or (TRACKED_ZERO_M if tracked else _TABLE_ZERO_M),
+            clock_std=0.0 if tracked else _TABLE_CLOCK,
+        )  # fmt: skip
     if fit.status != "ok" and "kind" not in tables.actuator.model_fields_set:
         doubt = f"[actuator] states no kind, so {fit.kind} was assumed. State kind if it is another"
         fit = replace(fit, status=f"{fit.status}. {doubt}")

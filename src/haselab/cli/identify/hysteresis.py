@@ -11,7 +11,7 @@ import numpy as np
 
 from haselab.base import Estimate
 from haselab.cli.columns import column_options
-from haselab.cli.common import INTEGER, REAL, answer_options
+from haselab.cli.common import INTEGER, REAL, answer_options, waiting
 from haselab.cli.identify.common import (
     FILE,
     FILES,
@@ -77,7 +77,8 @@ def hysteresis(
         rate = rate_hz_of(table, rate_hz, file)
         records.append(LoopRecord(table[source], table[output], rate, from_s))
     refuse_copies(files, [record.y for record in records])
-    fit = fit_hysteresis(records, model, operators=operators)
+    with waiting("fit of the hysteresis"):
+        fit = fit_hysteresis(records, model, operators=operators)
     emit_fit(fit, files, as_json, out)
     save_plot(plot, lambda: fit.chart(axis_names(source, output, table)))
 
@@ -158,6 +159,7 @@ def creep(
     rate = rate_hz_of(table, rate_hz, file)
     u = np.ones(table[output].size) if unit_step else table[source]
     record = Record.sampled(u, table[output], rate, input_before)
-    fit = fit_creep(record, model, leave_out_s=leave_out_s)
+    with waiting("fit of the creep"):
+        fit = fit_creep(record, model, leave_out_s=leave_out_s)
     emit_fit(_Forecast(fit, forecast_s), [file], as_json, out)
     save_plot(plot, lambda: fit.chart(axis_names(source, output, table)))

@@ -12,7 +12,7 @@ import numpy as np
 
 from haselab.base import InputError, ResultError
 from haselab.cli.actuator_file import load_actuator, save_section, warn_misspelled_in
-from haselab.cli.common import REAL, SEED, Real, answer_options, emit
+from haselab.cli.common import REAL, SEED, Real, answer_options, emit, waiting
 from haselab.cli.identify.common import axis_names
 from haselab.cli.model.loop_options import loop_options
 from haselab.cli.options import shared_option
@@ -210,7 +210,8 @@ def _own_design(
         _refuse_other_loop(kind, setting, loop)
         rate_hz, delay_s = 1.0 / setting.period_s, setting.delay_s or 0.0
     assert kind.design is not None
-    chosen = kind.choose(kind.design(setting), model)
+    with waiting(f"design of {kind.name}"):
+        chosen = kind.choose(kind.design(setting), model)
     guaranteed = {} if kind.robustness is None else kind.robustness(setting, dict(chosen.values))
     section: dict[str, object] = {
         "kind": kind.name,

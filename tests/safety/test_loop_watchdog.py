@@ -137,6 +137,40 @@ def test_an_actuator_with_a_high_resonance_may_move_as_fast_as_it_can() -> None:
         assert (found > 0, fault[: len(said)]) == (bool(said), said)
 
 
+QUICK = replace(MODEL, strain_low=-0.04, strain_high=0.1, resonance_rad_s=2.0 * math.pi * 15.5)
+
+
+def largest_step(zeta: float) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Strains, drives and references of a step by 0.86 of the range at 15.5 Hz, after 0.2 s."""
+    step = np.repeat([-0.03, 0.09], [20, 60])
+    strains = second_order(step + 0.03, QUICK.resonance_rad_s, zeta, 1.0) - 0.03
+    strains += 1e-4 * np.random.default_rng(4).standard_normal(80)
+    return strains, EQ4.voltage_v(step), step
+
+
+@pytest.mark.parametrize("zeta", [0.05, 0.17])
+def test_the_largest_step_of_a_quick_actuator_is_no_jump(zeta: float) -> None:
+    """A curling HASEL with 15.5 Hz and a damping of 0.17: the rate changes by 0.46 of the range."""
+    strains, drives, step = largest_step(zeta)
+    assert np.abs(np.diff(strains, 2)).max() > 0.3 * QUICK.range
+    settings = replace(SETTINGS, range_margin=1.0)
+    assert watched(strains, drives, step, LoopWatchdog(QUICK, settings)) == (-1, "")
+    constant = np.full(80, drives[0])  # the drive does not explain it
+    _, fault = watched(strains, constant, step, LoopWatchdog(QUICK, SETTINGS))
+    assert fault.startswith("Strain jumped")
+
+
+@pytest.mark.parametrize(("block", "share"), [(12, 0.4), (21, 1.2), (55, 0.4)])
+def test_a_jump_is_found_before_during_and_after_the_largest_step(block: int, share: float) -> None:
+    """In the 0.2 s after a step, the drive explains more."""
+    strains, drives, step = largest_step(0.17)
+    strains[block] += share * QUICK.range
+    watchdog = LoopWatchdog(QUICK, replace(SETTINGS, range_margin=1e3))
+    found, fault = watched(strains, drives, step, watchdog)
+    assert fault.startswith("Strain jumped")
+    assert found in (block, block + 1)
+
+
 def test_a_high_resonance_does_not_hide_a_broken_sensor() -> None:
     """At any resonance, a jump by 0.6 of the range is found."""
     for resonance_hz in (16.0, 50.0, 500.0):

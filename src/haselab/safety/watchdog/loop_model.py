@@ -68,10 +68,24 @@ class LoopModel:
     def quickness(self) -> float:
         """How much more than a slow actuator's the rate of strain may change from block to block.
 
-        After a step by x without damping, it changes by $2 x (1 - \\cos\\omega T)$ at most.
+        It is for motion without a change of the drive; `rate_change` adds what the drive explains.
         """
-        turned = min(self.resonance_rad_s * self.block_s, math.pi)
-        return min(max((1.0 - math.cos(turned)) / _SLOW, 1.0), _MOST_QUICK)
+        return min(max(0.5 * self.rate_change(1.0) / _SLOW, 1.0), _MOST_QUICK)
+
+    def rate_change(self, step: float, blocks: int = 1) -> float:
+        """Largest change of the rate of strain, per block, after a step of the drive.
+
+        Without damping, the second difference is $2 x (1 - \\cos\\omega T)$ at most. A controller
+        that puts out a voltage steps farther than its reference.
+
+        Args:
+            step: x, of the static strain.
+            blocks: between two measured strains.
+        Returns:
+            The change; 0 if the resonance is not known.
+        """
+        turned = min(self.resonance_rad_s * self.block_s * blocks, math.pi)
+        return 2.0 * step * (1.0 - math.cos(turned)) / blocks
 
 
 def loop_model(

@@ -171,6 +171,19 @@ def test_a_jump_is_found_before_during_and_after_the_largest_step(block: int, sh
     assert found in (block, block + 1)
 
 
+def test_the_capacitance_of_slack_pouches_is_named_as_a_reason() -> None:
+    """Only where the map does not cover it, and the capacitance is that of slack pouches."""
+    line = (4.9e8, -0.3, 0.0, 0.0)  # -0.25 at 1.02e-10 F, the end of range and margin
+    pouches = replace(MODEL, capacitance_map=line, capacitance_f=6e-10, slack_f=1e-10)
+    for farad, slack in ((1.02e-10, True), (0.8e-10, False), (6e-10, False)):
+        sample = LoopSample(0.0, farad, 0.0, 0.0)
+        for model in (pouches, replace(pouches, slack_f=0.0)):
+            watchdog = LoopWatchdog(model, replace(SETTINGS, range_margin=0.4))
+            fault = watchdog.fault(codes_of(np.random.default_rng(1)), sample)
+            assert fault.startswith("Capacitance out of range") == (farad < 2e-10)
+            assert ("slack at any length" in fault) == (slack and model is pouches)
+
+
 def test_a_high_resonance_does_not_hide_a_broken_sensor() -> None:
     """At any resonance, a jump by 0.6 of the range is found."""
     for resonance_hz in (16.0, 50.0, 500.0):

@@ -198,8 +198,18 @@ def _own_design(
             (loop["delay_s"], stated[1], usual.measurement_delay_s),
         )
     )
-    strains = (-math.inf, math.inf) if actuator is None else actuator.reachable()
-    low, high = strains
+    low, high = strains = (-math.inf, math.inf)
+    if actuator is not None:
+        low, high = actuator.reachable()
+        strains = actuator.sensed_range()
+        if strains != (low, high):
+            click.echo(
+                f"haselab: The limits are strains of {strains[0]:.3g} to {strains[1]:.3g} instead "
+                f"of {low:.3g} to {high:.3g}, which the drive reaches: beyond, the drive is near "
+                "0 V, where the pouches are slack and the capacitance hardly depends on the "
+                f"length. {model}",
+                err=True,
+            )
     if actuator is not None and kind.output == "voltage":
         low, high = actuator.low_v, actuator.high_v
     setting = ControllerSetting(1.0 / rate_hz, low, high, delay_s=delay_s, actuator=actuator)

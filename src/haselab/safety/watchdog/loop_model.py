@@ -41,6 +41,7 @@ class LoopModel:
         capacitance_f: a capacitance in the range of the map; 0: unknown.
         alternates: whether the sign of the drive alternates on purpose.
         resonance_rad_s: highest natural frequency of the actuator; 0: unknown.
+        slack_f: capacitance at 0 V of an actuator whose pouches are slack there; 0: it has none.
     """
 
     block_s: float
@@ -58,6 +59,7 @@ class LoopModel:
     capacitance_f: float
     alternates: bool = False
     resonance_rad_s: float = 0.0
+    slack_f: float = 0.0
 
     @property
     def range(self) -> float:
@@ -98,6 +100,7 @@ def loop_model(
     capacitance_f: float = 0.0,
     alternates: bool = False,
     resonance_rad_s: float = 0.0,
+    slack_f: float = 0.0,
 ) -> LoopModel:
     """Build the model of a loop on a rig.
 
@@ -111,6 +114,7 @@ def loop_model(
         capacitance_f: see `LoopModel`.
         alternates: see `LoopModel`.
         resonance_rad_s: see `LoopModel`.
+        slack_f: see `LoopModel`.
     """
     low, high = min(saturation[0], 0.0), max(saturation[1], 0.0)
     strain = np.linspace(low, high, _GRID)
@@ -135,6 +139,7 @@ def loop_model(
         capacitance_f=capacitance_f,
         alternates=alternates,
         resonance_rad_s=resonance_rad_s,
+        slack_f=slack_f,
     )
 
 

@@ -15,6 +15,7 @@ __all__ = ["WINDOW_S", "Delay", "Jumps", "Plausible", "Repeats", "Swings"]
 
 WINDOW_S = 0.5
 _MEMORY_S = 1.0  # window in which a value must not repeat often
+_SLACK = 0.05  # relative difference from the capacitance of slack pouches
 _CHATTER_S = 0.2
 _SLOW_S = 3.0
 _SCATTER = 6.0  # a single change may exceed its limit by this multiple of the recent RMS
@@ -33,7 +34,7 @@ class Plausible:
     def __init__(self, model: LoopModel, settings: WatchdogSettings) -> None:
         margin = settings.range_margin * model.range
         self._low, self._high = model.strain_low - margin, model.strain_high + margin
-        self._farad = (0.0, math.inf)
+        self._farad, self._slack_f = (0.0, math.inf), model.slack_f
         if model.capacitance_map is not None:
             self._farad = capacitance_range(
                 model.capacitance_map, self._low, self._high, model.capacitance_f
@@ -42,6 +43,16 @@ class Plausible:
     def fault(self, strain: float, capacitance_f: float | None) -> str:
         """Return why the loop must stop, or an empty text; missing values (NaN) are ignored."""
         low_f, high_f = self._farad
+        if capacitance_f is not None and abs(capacitance_f - self._slack_f) < min(
+            _SLACK * self._slack_f, low_f - self._slack_f
+        ):
+            return (
+                f"Capacitance out of range: {capacitance_f:.4g} F, but the strain map covers "
+                f"{low_f:.3g} to {high_f:.3g} F. The pouches of this actuator have "
+                f"{self._slack_f:.3g} F at 0 V, where they are slack at any length: keep the "
+                "desired strain away from that of 0 V, or design the controller again. If the "
+                "drive was not near 0 V, check the monitors and their cables."
+            )
         if capacitance_f is not None and not low_f <= capacitance_f <= high_f:
             return (
                 f"Capacitance out of range: {capacitance_f:.4g} F, but the strain map covers "

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import math
+import re
 import tomllib
 
 import pytest
@@ -82,6 +83,17 @@ def test_the_limits_end_before_the_pouches_are_slack(tmp_path, capsys):
     limits = tomllib.loads(file.read_text())["controller"]["limits"]
     assert (limits["low"], limits["high"]) == found.sensed_range() != found.reachable()
     assert "where the pouches are slack" in said and f"instead of {limits['low']:.3g}" in said
+
+
+def test_a_reach_without_zero_strain_is_refused(tmp_path, capsys):
+    """Of a drive to 0.8 V, whose loops `run` would refuse: 0.0963 m is the length at 0.9 V."""
+    file = tmp_path / "A.toml"
+    file.write_text(CURLING.replace("high_v = 2.0", "high_v = 0.8"))
+    before = file.read_text()
+    code, _, said = run(capsys, "design", file, "--controller", "observer")
+    assert code == 3 and file.read_text() == before
+    assert re.search(r"starts at zero strain, but .* drive of 0 to 0\.8 V reaches strains of", said)
+    assert "Change the limits of the drive, or define zero strain as the length at" in said
 
 
 def test_a_kind_that_guarantees_margins_prints_them_and_writes_them(tmp_path, capsys):

@@ -34,6 +34,7 @@ from haselab.controllers import (
     ControllerSetting,
     known_actuator,
 )
+from haselab.models.maps import allow_start
 from haselab.models.posterior import PlantPosterior
 from haselab.pipelines.design.answer import (
     design_answer,
@@ -201,6 +202,14 @@ def _own_design(
     low, high = strains = (-math.inf, math.inf)
     if actuator is not None:
         low, high = actuator.reachable()
+        if not allow_start((low, high)):
+            raise ResultError(
+                f"A loop starts at zero strain, but by the physical model the drive of "
+                f"{actuator.low_v:g} to {actuator.high_v:g} V reaches strains of {low:.3g} to "
+                f"{high:.3g}. Change the limits of the drive, or define zero strain as the length "
+                "at a drive within these limits (zero_length_m) and fit the maps and the model "
+                f"again. {model}"
+            )
         strains = actuator.sensed_range()
         if strains != (low, high):
             click.echo(

@@ -101,6 +101,26 @@ def test_an_open_step_that_the_drive_does_not_reach_is_refused_before_the_run(
         with_actuator_tables(study, ActuatorTables.model_validate({"drive": drive}))
 
 
+@pytest.mark.parametrize("wide", [3.0, 1e3, 1e30])
+def test_limits_far_beyond_the_map_are_narrowed_to_what_the_drive_reaches(wide):
+    """Before, only strain 0 of 1501 strains was within the drive, so the reach was 0 to 0."""
+    eq4 = VoltageMap(1.324, 3.124, -0.2805, -26.92)
+    usual = eq4.reach((eq4.strain_low, eq4.strain_high), 0.0, 1.6)
+    found = eq4.reach((-wide, wide), 0.0, 1.6)
+    assert found == pytest.approx(usual, abs=2.0 * wide / 1500.0 if wide < 10.0 else 1e-12)
+    assert eq4.reach((5.0, wide + 5.0), 0.0, 1.6) is None  # beyond the map alone
+
+
+def test_limits_that_a_study_cannot_use_are_named():
+    tables, _ = file_with_observer()
+    controller = tables.controller
+    assert controller is not None and controller.limits is not None
+    ends = controller.limits.model_copy(update={"low": -1e30, "high": 1e30})
+    wide = controller.model_copy(update={"limits": ends})
+    with pytest.raises(InputError, match=r"limits of -1e\+30 to 1e\+30.* --limits to 'haselab"):
+        with_actuator_tables(voltage_study(0.02, 1), tables.model_copy(update={"controller": wide}))
+
+
 def voltage_study(step: float, open_trials: int) -> Study:
     """Steps with an observer, whose limits are those of the file."""
     steps = {"step": step, "zero_s": 4.0, "step_s": 6.0, "rest_s": 10.0, "frame_rate_hz": 20.0}

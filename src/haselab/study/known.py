@@ -6,6 +6,8 @@ import contextlib
 import math
 from collections.abc import Mapping
 
+from pydantic import ValidationError
+
 from haselab.base import InputError
 from haselab.controllers import CONTROLLERS, KnownActuator, known_actuator
 from haselab.models.actuator import ActuatorTables
@@ -67,12 +69,20 @@ def with_actuator_tables(study: Study, tables: ActuatorTables) -> Study:
                 "design, or add limits = {low = -0.05, high = 0.1}."
             )
         chosen = CONTROLLERS.find(held.kind).choose(_given(held.parameters, held.kind))
-        changes["control"] = Control(
-            kind=held.kind,
-            parameters=dict(chosen.values),
-            saturation_low=held.limits.low,
-            saturation_high=held.limits.high,
-        )
+        low, high = held.limits.low, held.limits.high
+        try:
+            changes["control"] = Control(
+                kind=held.kind,
+                parameters=dict(chosen.values),
+                saturation_low=low,
+                saturation_high=high,
+            )
+        except ValidationError as error:
+            reasons = "; ".join(str(one["msg"]) for one in error.errors())
+            raise InputError(
+                f"[controller] has limits of {low:g} to {high:g}, and a study cannot use them: "
+                f"{reasons}. Give other --limits to 'haselab design'."
+            ) from None
     complete = study.model_copy(update=changes)
     if study.has("steps") and not study.has("triangle") and tables.drive.voltage_map is not None:
         _require_steps(complete, tables)

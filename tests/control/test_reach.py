@@ -1,5 +1,7 @@
 """Range of a controller's output that the drive can produce."""
 
+import math
+
 import numpy as np
 import pytest
 
@@ -7,11 +9,13 @@ from haselab.base import InputError, ResultError
 from haselab.control.gains import Saturation
 from haselab.control.reach import default_step, reachable_range
 from haselab.control.simulate import LoopSetting
+from haselab.controllers import known_actuator
 from haselab.models import RationalModel
 from haselab.models.actuator import ActuatorTables
 from haselab.models.maps import VoltageMap
 from haselab.rig.chip.design import strains_within
 from haselab.study.definition import Study
+from haselab.study.feasibility import check_settings
 from haselab.study.known import with_actuator_tables
 
 # an actuator whose zero strain is its unloaded length: 14 mV there
@@ -95,3 +99,82 @@ def test_an_open_step_that_the_drive_does_not_reach_is_refused_before_the_run(
     study = Study.model_validate({"name": "far", "steps": steps})
     with pytest.raises(InputError, match=message):
         with_actuator_tables(study, ActuatorTables.model_validate({"drive": drive}))
+
+
+@pytest.mark.parametrize("wide", [3.0, 1e3, 1e30])
+def test_limits_far_beyond_the_map_are_narrowed_to_what_the_drive_reaches(wide):
+    """Before, only strain 0 of 1501 strains was within the drive, so the reach was 0 to 0."""
+    eq4 = VoltageMap(1.324, 3.124, -0.2805, -26.92)
+    usual = eq4.reach((eq4.strain_low, eq4.strain_high), 0.0, 1.6)
+    found = eq4.reach((-wide, wide), 0.0, 1.6)
+    assert found == pytest.approx(usual, abs=2.0 * wide / 1500.0 if wide < 10.0 else 1e-12)
+    assert eq4.reach((5.0, wide + 5.0), 0.0, 1.6) is None  # beyond the map alone
+
+
+def test_limits_that_a_study_cannot_use_are_named():
+    tables, _ = file_with_observer()
+    controller = tables.controller
+    assert controller is not None and controller.limits is not None
+    ends = controller.limits.model_copy(update={"low": -1e30, "high": 1e30})
+    wide = controller.model_copy(update={"limits": ends})
+    with pytest.raises(InputError, match=r"limits of -1e\+30 to 1e\+30.* --limits to 'haselab"):
+        with_actuator_tables(voltage_study(0.02, 1), tables.model_copy(update={"controller": wide}))
+
+
+def voltage_study(step: float, open_trials: int) -> Study:
+    """Steps with an observer, whose limits are those of the file."""
+    steps = {"step": step, "zero_s": 4.0, "step_s": 6.0, "rest_s": 10.0, "frame_rate_hz": 20.0}
+    steps |= {"open_trials": open_trials, "pi_trials": 0, "pid_trials": 0}
+    return Study.model_validate({"name": "far", "steps": steps})
+
+
+def file_with_observer() -> tuple[ActuatorTables, float]:
+    """An actuator whose map needs twice the drive of the physical model, and its highest strain."""
+    length_m, high_v = 0.051, 2.0
+    parameters = {"shell.shear_modulus_pa": 15e3}
+    sections = {
+        "actuator": {"geometry": {"zero_length_m": length_m}},
+        "model": {"physical": {"kind": "planar-hasel", "mass_kg": 0.25, "parameters": parameters}},
+        "drive": {"low_v": 0.0, "high_v": high_v, "gain_v_per_v": 5000.0},
+    }
+    known = known_actuator(ActuatorTables.model_validate(sections))
+    assert known is not None
+    low, high = known.reachable()
+    # Straight lines: zero strain at 1 V, and the highest strain at 3 V instead of 2 V.
+    eq4 = {"a1_v": 1.0, "b1": math.log(3.0) / high, "a2_v": 0.0, "b2": 0.0}
+    sections["drive"]["voltage_map"] = eq4 | {"strain_low": -0.01, "strain_high": 0.5 * high}
+    gains = {"bandwidth_rad_s": 20.0, "load_n": 0.1, "shake_m_s2": 0.01, "reserve": 0.1}
+    ends = {"low": low, "high": high}
+    sections["controller"] = {"kind": "observer", "parameters": gains, "limits": ends}
+    return ActuatorTables.model_validate(sections), high
+
+
+def test_a_controller_with_a_voltage_output_reaches_what_its_physical_model_does():
+    tables, high = file_with_observer()
+    step = 0.9 * high
+    far = with_actuator_tables(voltage_study(step, 0), tables)
+    assert far.control.kind == "observer" and far.control.saturation_high == high
+    said = (
+        r"extrapolated: the map .* for the trials in open loop\. .*'observer' .*open_trials = 0\."
+    )
+    with pytest.raises(InputError, match=said):
+        with_actuator_tables(voltage_study(step, 1), tables)
+    with pytest.raises(InputError, match=r"the controller 'observer' does not reach\. Choose a"):
+        with_actuator_tables(voltage_study(1.1 * high, 0), tables)
+    with pytest.raises(InputError, match=r"Choose a step between 0 and [0-9.]+\.$"):  # neither one
+        with_actuator_tables(voltage_study(1.1 * high, 1), tables)
+    controller = tables.controller
+    assert controller is not None
+    in_strain = controller.model_copy(update={"kind": "pid", "parameters": {"kp": 0.1, "ki": 1.0}})
+    with pytest.raises(InputError, match="by the voltage map"):  # its output passes the map
+        with_actuator_tables(
+            voltage_study(step, 0), tables.model_copy(update={"controller": in_strain})
+        )
+
+
+def test_a_chirp_needs_a_trial_in_open_loop():
+    chirp = {"amplitude_v": 0.5, "start_hz": 0.1, "stop_hz": 10.0, "duration_s": 9.0, "hold_s": 4.0}
+    study = voltage_study(0.02, 0).model_dump(exclude_unset=True) | {"control": {"kind": "open"}}
+    check_settings(Study.model_validate(study))
+    with pytest.raises(InputError, match=r"open_trials is 0, but the fit of \[chirp\]"):
+        check_settings(Study.model_validate(study | {"chirp": chirp | {"frame_rate_hz": 200.0}}))

@@ -3,6 +3,9 @@
 from __future__ import annotations
 
 import math
+import tomllib
+from dataclasses import replace
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -15,6 +18,7 @@ from haselab.actuators import (
 )
 from haselab.base import InputError, LimitError
 from haselab.controllers import (
+    CONTROLLERS,
     ControllerKind,
     ControllerSetting,
     KnownActuator,
@@ -23,7 +27,14 @@ from haselab.controllers import (
 )
 from haselab.controllers.motion_model import MotionModel
 from haselab.models.actuator import ActuatorTables
+from haselab.rig.twin.config import TwinConfig
+from haselab.scoreboard import CLASSES, plant
+from haselab.scoreboard.devices import Device
+from haselab.scoreboard.knowledge import true_actuator
+from haselab.scoreboard.play import Scenario, play
+from haselab.scoreboard.tasks.task import staircase
 
+ROOT = Path(__file__).resolve().parents[2]
 LONGEST_M = 0.08
 # kind, hung mass, length at strain 0, highest drive at a gain of 5000
 KINDS = [("planar-hasel", 0.25, 0.051, 2.0), ("peano-hasel", 0.2, 0.115, 1.4),
@@ -115,6 +126,64 @@ def test_the_reachable_range_ends_at_the_drive_the_field_or_the_pull_in():
     assert end_v < 0.95 * 5000.0 * 3.0
     with pytest.raises(LimitError, match="no equilibrium"):
         equilibrium_m(stack.law, 1.01 * end_v, GRAVITY_M_S2 * 0.5)
+
+
+CURLING = TwinConfig.model_validate(
+    tomllib.loads((ROOT / "examples/kinds/curling-hasel/twin.toml").read_text())
+)
+
+
+def curling(**changes: float) -> KnownActuator:
+    """The curling HASEL of the examples, with the noise of its lock-in."""
+    found = true_actuator(Device("curling", "", CURLING, 2.0, 1.0))
+    return replace(found, capacitance_noise_f=5.3e-13, **changes)
+
+
+def test_the_sensed_range_ends_before_the_pouches_are_slack():
+    """Near 0 V, the capacitance of this curling HASEL hardly depends on its length."""
+    actuator = curling()
+    (low, high), (first, last) = actuator.reachable(), actuator.sensed_range()
+    assert first == low and high - 0.1 * (high - low) < last < high
+    pulls = [actuator.static_pull_n(strain) for strain in (low, last, high)]
+    # 0.075 and the share of the creep, 0.05 (next of 400 strains); the end of the range has less
+    assert 0.125 <= pulls[1] / pulls[0] < 0.13 and pulls[2] / pulls[0] < 0.03
+    ends_m = actuator.length_m(last) + np.array([-1e-4, 1e-4])
+    idle_f, driven_f = (
+        np.ptp(actuator.law.differential_capacitance_f(ends_m, 5000.0 * drive_v))
+        for drive_v in (0.0, actuator.static_drive_v(last))
+    )
+    assert driven_f > 20.0 * idle_f
+    slack_f = [float(actuator.law.capacitance_f(actuator.length_m(s))) for s in (low, high)]
+    assert min(slack_f) < actuator.slack_f < max(slack_f) < 1.01 * min(slack_f)
+    # Loops start at strain 0, here the length at 0 V, which stays.
+    from_rest = replace(actuator, zero_length_m=actuator.length_m(high))
+    assert from_rest.sensed_range() == from_rest.reachable()
+    # With a lowest drive at which the capacitance shows the length, nothing is taken off.
+    biased = curling(low_v=0.5)
+    assert biased.sensed_range() == biased.reachable() and biased.slack_f == 0.0
+
+
+@pytest.mark.parametrize("setting", KINDS, ids=[row[0] for row in KINDS])
+def test_the_sensed_range_is_the_reachable_one_where_the_capacitance_shows_the_length(setting):
+    actuator = known(*setting)
+    assert actuator.sensed_range() == actuator.reachable() and actuator.slack_f == 0.0
+
+
+def test_a_loop_stays_calm_at_the_end_of_the_sensed_range(monkeypatch):
+    """After the largest step; beyond, at 98.5 % of the reachable range, it loses the length."""
+    monkeypatch.setattr(plant, "TRAINED", 1.5)  # the usual weight straightens it too far
+    actuator, device = curling(), Device("curling", "", CURLING, 2.0, 1.0)
+    low, high = actuator.reachable()
+    gains = {"bandwidth_rad_s": 81.5, "load_n": 0.085, "shake_m_s2": 0.01, "reserve": 0.15}
+    chosen = CONTROLLERS.find("mpc").choose(gains | {"pole_rad_s": 180.0, "stage_s": 0.01})
+    errors = []
+    for end in (actuator.sensed_range()[1], low + 0.985 * (high - low)):
+        wanted = staircase(((-math.inf, low + 0.05 * (high - low)), (0.0, end)))
+        scenario = Scenario(device, actuator.zero_length_m, 2.0, wanted)
+        host, rng = CLASSES["host-100hz"], np.random.default_rng(2)
+        trace = play(scenario, chosen, host, actuator, rng)
+        errors.append(float(np.abs(trace.strain[trace.time_s > 1.0] - end).max()) / (high - low))
+    assert errors[0] < 0.005 and errors[1] > 0.01  # shares of the range
 
 
 def test_a_softened_actuator_needs_less_voltage():

@@ -137,6 +137,53 @@ def test_an_actuator_with_a_high_resonance_may_move_as_fast_as_it_can() -> None:
         assert (found > 0, fault[: len(said)]) == (bool(said), said)
 
 
+QUICK = replace(MODEL, strain_low=-0.04, strain_high=0.1, resonance_rad_s=2.0 * math.pi * 15.5)
+
+
+def largest_step(zeta: float) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Strains, drives and references of a step by 0.86 of the range at 15.5 Hz, after 0.2 s."""
+    step = np.repeat([-0.03, 0.09], [20, 60])
+    strains = second_order(step + 0.03, QUICK.resonance_rad_s, zeta, 1.0) - 0.03
+    strains += 1e-4 * np.random.default_rng(4).standard_normal(80)
+    return strains, EQ4.voltage_v(step), step
+
+
+@pytest.mark.parametrize("zeta", [0.05, 0.17])
+def test_the_largest_step_of_a_quick_actuator_is_no_jump(zeta: float) -> None:
+    """A curling HASEL with 15.5 Hz and a damping of 0.17: the rate changes by 0.46 of the range."""
+    strains, drives, step = largest_step(zeta)
+    assert np.abs(np.diff(strains, 2)).max() > 0.3 * QUICK.range
+    settings = replace(SETTINGS, range_margin=1.0)
+    assert watched(strains, drives, step, LoopWatchdog(QUICK, settings)) == (-1, "")
+    constant = np.full(80, drives[0])  # the drive does not explain it
+    _, fault = watched(strains, constant, step, LoopWatchdog(QUICK, SETTINGS))
+    assert fault.startswith("Strain jumped")
+
+
+@pytest.mark.parametrize(("block", "share"), [(12, 0.4), (21, 1.2), (55, 0.4)])
+def test_a_jump_is_found_before_during_and_after_the_largest_step(block: int, share: float) -> None:
+    """In the 0.2 s after a step, the drive explains more."""
+    strains, drives, step = largest_step(0.17)
+    strains[block] += share * QUICK.range
+    watchdog = LoopWatchdog(QUICK, replace(SETTINGS, range_margin=1e3))
+    found, fault = watched(strains, drives, step, watchdog)
+    assert fault.startswith("Strain jumped")
+    assert found in (block, block + 1)
+
+
+def test_the_capacitance_of_slack_pouches_is_named_as_a_reason() -> None:
+    """Only where the map does not cover it, and the capacitance is that of slack pouches."""
+    line = (4.9e8, -0.3, 0.0, 0.0)  # -0.25 at 1.02e-10 F, the end of range and margin
+    pouches = replace(MODEL, capacitance_map=line, capacitance_f=6e-10, slack_f=1e-10)
+    for farad, slack in ((1.02e-10, True), (0.8e-10, False), (6e-10, False)):
+        sample = LoopSample(0.0, farad, 0.0, 0.0)
+        for model in (pouches, replace(pouches, slack_f=0.0)):
+            watchdog = LoopWatchdog(model, replace(SETTINGS, range_margin=0.4))
+            fault = watchdog.fault(codes_of(np.random.default_rng(1)), sample)
+            assert fault.startswith("Capacitance out of range") == (farad < 2e-10)
+            assert ("slack at any length" in fault) == (slack and model is pouches)
+
+
 def test_a_high_resonance_does_not_hide_a_broken_sensor() -> None:
     """At any resonance, a jump by 0.6 of the range is found."""
     for resonance_hz in (16.0, 50.0, 500.0):

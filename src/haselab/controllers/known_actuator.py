@@ -40,7 +40,12 @@ Floats = NDArray[np.float64]
 _USUAL_GAIN = 5000.0
 _FAR = 3.0  # widths of the reachable range: farther, no load moves it
 _NEWTON_STEPS = 8  # each doubles the correct digits
+# A loop near 0 V needs this share of the largest pull, besides what creep takes from it. With two
+# thirds of it, loops of a curling HASEL sometimes lost the length after the largest step.
+_KEPT_PULL, _MOST_KEPT = 0.075, 0.5
+_BLIND = 5.0  # times less capacitance per length at the lowest drive than at the one that holds
 _USUAL_NOISE = 2e-4  # strain, where it is not known
+_SENSED_POINTS = 401  # strains among which the end of the sensed range is found
 _BENCH = ("camera.", "sensing.", "start.")  # parameters of a fit that are none of the law
 
 
@@ -266,6 +271,53 @@ class KnownActuator:
             )
         found = self.strain(float(lengths[first])), self.strain(float(lengths[last]))
         return min(found), max(found)
+
+    def sensed_range(self) -> tuple[float, float]:
+        """The reachable strains at which the capacitance keeps determining the length.
+
+        Where the pouches of an actuator are slack near 0 V, the capacitance hardly depends on the
+        length. A loop that comes there loses the length, so the range ends before, but not before
+        strain 0, where loops start.
+
+        Returns:
+            Lowest and highest strain; the reachable range if the lowest drive is not blind.
+        Raises:
+            InputError: See `reachable`.
+        """
+        low, high = self.reachable()
+        end = self._last_sensed
+        if end is None:
+            return low, high
+        return (
+            (min(end, max(low, 0.0)), high) if self.elongates else (low, max(end, min(high, 0.0)))
+        )
+
+    @cached_property
+    def _last_sensed(self) -> float | None:
+        """Strain nearest to that of the lowest drive that loops can sense; None: all of them."""
+        if len(self.table.pull_n_v2) == 1:  # the capacitance does not depend on the voltage
+            return None
+        low, high = self.reachable()
+        strains = np.linspace(*((low, high) if self.elongates else (high, low)), _SENSED_POINTS)
+        pulls = np.abs([self.static_pull_n(strain) for strain in strains.tolist()])
+        share = min(_KEPT_PULL + sum(self.law.losses.branch_share), _MOST_KEPT)
+        end = float(strains[np.argmax(pulls >= share * pulls[-1])])
+        driven, idle = (self._per_length(end, v) for v in (self.static_drive_v(end), self.low_v))
+        return end if _BLIND * idle < driven else None
+
+    @cached_property
+    def slack_f(self) -> float:
+        """Sensed capacitance at 0 V if it hardly depends on the length there; else 0."""
+        if (end := self._last_sensed) is None:
+            return 0.0
+        return float(self.law.capacitance_f(self.length_m(end))) * self.sensing_scale
+
+    def _per_length(self, strain: float, drive_v: float) -> float:
+        """Capacitance per length at a drive, in F/m, positive."""
+        ends_m = self.length_m(strain) + self.table.step_m * np.array([-1.0, 1.0])
+        volt = max(self.gain_v_per_v * abs(drive_v), math.sqrt(self.carrier_v2))
+        ends_f = self.law.differential_capacitance_f(ends_m, volt)
+        return abs(float(ends_f[1] - ends_f[0]))
 
     def limited_strain(self, strain: float) -> float:
         """A desired strain, at most three times the width of the reachable range beyond its ends.

@@ -12,6 +12,7 @@ from haselab.base import InputError, LimitError
 __all__ = ["LinearMap", "VoltageMap", "allow_start", "require_start"]
 
 Floats = NDArray[np.float64]
+_MUCH_WIDER = 10.0  # times the map's range
 _REACH_POINTS = 1501
 _ITERATIONS = 60
 _NEAR_ZERO = 0.05  # of a strain range's width: largest distance from 0 of an end to start at
@@ -83,13 +84,19 @@ class VoltageMap:
             low_v: lowest voltage, in V.
             high_v: highest voltage, in V.
         Returns:
-            Lowest and highest strain; None if no voltage is within the limits.
+            Lowest and highest strain; None if no voltage is within the limits. A range more than
+            ten times as wide as that of the map is narrowed to the map's, with zero, first.
         Example:
             >>> eq4 = VoltageMap(1.324, 3.124, -0.2805, -26.92)
             >>> low, high = eq4.reach((-0.05, 0.1), 0.0, 1.6)
             >>> low, round(high, 4)
             (-0.05, 0.0692)
         """
+        low, high = strains
+        if high - low > _MUCH_WIDER * (self.strain_high - self.strain_low):  # few points in reach
+            strains = max(low, min(self.strain_low, 0.0)), min(high, max(self.strain_high, 0.0))
+            if strains[0] >= strains[1]:
+                return None
         zero = np.clip(0.0, *strains)  # not between two points, where it is the end of the range
         grid = np.unique(np.append(np.linspace(*strains, _REACH_POINTS), zero))
         volt = self.voltage_v(grid)

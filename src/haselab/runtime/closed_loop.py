@@ -230,6 +230,7 @@ def _watchdog(rig: GuardedRig, carrier: tuple[float, float], loop: LoopSettings)
         0.5 * (range_f[0] + range_f[1]),
         loop.controller.kind.alternates,
         _resonance_rad_s(loop),
+        0.0 if loop.actuator is None else loop.actuator.slack_f,
     )
     return LoopWatchdog(
         model, settings.loop, settings.rating, rig.present_drive_v, rig.bench.is_settled

@@ -6,6 +6,8 @@ import contextlib
 import math
 from collections.abc import Mapping
 
+from pydantic import ValidationError
+
 from haselab.base import InputError
 from haselab.controllers import CONTROLLERS, KnownActuator, known_actuator
 from haselab.models.actuator import ActuatorTables
@@ -13,9 +15,12 @@ from haselab.models.maps import allow_start
 from haselab.study.definition import Study
 from haselab.study.fits.maps import Maps, require_open_steps
 from haselab.study.fits.resolution import ZERO_PX
+from haselab.study.own_controller import own_controller
 from haselab.study.tables import Control, OperatingPoint
 
 __all__ = ["known_values", "with_actuator_tables"]
+
+_SAME_STRAIN = 1e-9  # the limits of a design are this reach, as decimal numbers
 
 
 def known_values(tables: ActuatorTables) -> dict[type, object]:
@@ -49,18 +54,8 @@ def with_actuator_tables(study: Study, tables: ActuatorTables) -> Study:
         of the actuator file, within its limits.
     Raises:
         InputError: the controller's kind is not registered, does not accept its parameters, or has
-            no limits; or the drive does not reach an open-loop step.
+            no limits; or the drive or the controller does not reach the step.
     """
-    steps = study.steps if study.has("steps") else None
-    to_volt = tables.drive.voltage_map
-    if steps and steps.open_trials and to_volt is not None and not study.has("triangle"):
-        low_v, high_v = tables.drive_ends_v()
-        require_open_steps(
-            to_volt.map(),
-            steps.step,
-            -math.inf if low_v is None else low_v,
-            math.inf if high_v is None else high_v,
-        )
     changes: dict[str, object] = {}
     open_point = study.operating_point.baseline_v is None and not study.has("triangle")
     if open_point and tables.drive.voltage_map is not None:
@@ -74,13 +69,57 @@ def with_actuator_tables(study: Study, tables: ActuatorTables) -> Study:
                 "design, or add limits = {low = -0.05, high = 0.1}."
             )
         chosen = CONTROLLERS.find(held.kind).choose(_given(held.parameters, held.kind))
-        changes["control"] = Control(
-            kind=held.kind,
-            parameters=dict(chosen.values),
-            saturation_low=held.limits.low,
-            saturation_high=held.limits.high,
+        low, high = held.limits.low, held.limits.high
+        try:
+            changes["control"] = Control(
+                kind=held.kind,
+                parameters=dict(chosen.values),
+                saturation_low=low,
+                saturation_high=high,
+            )
+        except ValidationError as error:
+            reasons = "; ".join(str(one["msg"]) for one in error.errors())
+            raise InputError(
+                f"[controller] has limits of {low:g} to {high:g}, and a study cannot use them: "
+                f"{reasons}. Give other --limits to 'haselab design'."
+            ) from None
+    complete = study.model_copy(update=changes)
+    if study.has("steps") and not study.has("triangle") and tables.drive.voltage_map is not None:
+        _require_steps(complete, tables)
+    return complete
+
+
+def _require_steps(study: Study, tables: ActuatorTables) -> None:
+    """Refuse a step beyond the reach of the voltage map in open loop, or of the controller.
+
+    A controller that puts out a voltage reaches what the physical model says, not the map.
+
+    Raises:
+        InputError: the drive or the controller does not reach it.
+    """
+    to_volt, step, own = tables.voltage_map(), study.steps.step, own_controller(study)
+    low_v, high_v = tables.drive_ends_v()
+    ends_v = -math.inf if low_v is None else low_v, math.inf if high_v is None else high_v
+    closed, low, high = "", -math.inf, math.inf
+    if own is not None and own.kind.output == "voltage":
+        actuator = known_actuator(tables)
+        physical = (-math.inf, math.inf) if actuator is None else actuator.reachable()
+        low = max(study.control.saturation_low, physical[0] - _SAME_STRAIN)
+        high = min(study.control.saturation_high, physical[1] + _SAME_STRAIN)
+        closed = (
+            f"The controller {own.kind.name!r} puts out a voltage and reaches {low:.3g} to "
+            f"{high:.3g} by the physical model: play it alone with open_trials = 0."
         )
-    return study.model_copy(update=changes)
+    if study.steps.open_trials:
+        require_open_steps(to_volt, step, *ends_v, closed if low <= step <= high else "")
+    elif not closed:
+        require_open_steps(to_volt, step, *ends_v)
+    if not low <= step <= high:
+        assert own is not None
+        raise InputError(
+            f"step = {step:g} in [steps] is a strain that the controller {own.kind.name!r} does "
+            f"not reach. Choose a step between {low:.4g} and {high:.4g}."
+        )
 
 
 def _baseline_v(tables: ActuatorTables) -> float:

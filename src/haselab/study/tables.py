@@ -166,7 +166,13 @@ class Steps(Section):
         ge=0, le=_DAY_S, description="wait at 0 V before each trial", examples=[60.0]
     )
     frame_rate_hz: float = _frames(20.0)
-    open_trials: int = Field(ge=1, le=1000, description="trials in open loop", examples=[2])
+    open_trials: int = Field(
+        ge=0,
+        le=1000,
+        description="trials in open loop; 0 is for a study without [chirp], for a step that only "
+        "the controller of custom_trials reaches",
+        examples=[2],
+    )
     pi_trials: int = Field(ge=0, le=1000, description="trials with the PI", examples=[2])
     pid_trials: int = Field(ge=0, le=1000, description="trials with the PID", examples=[2])
     paper_chain_trials: int = Field(

@@ -87,6 +87,18 @@ def test_a_trial_without_capacitance_is_named() -> None:
     assert "'trial' has no valid capacitance for 1.55 s" in found.reason("S24.rise_closed")
 
 
+def test_a_controller_played_alone_has_its_own_results() -> None:
+    """`open_trials = 0`; if its trials cannot be evaluated either, the message has both reasons."""
+    own = {OWN: trials(1.0)}
+    both = compare_trials({"open loop": trials(0.8)} | own, MAPS, STUDY, 1e-4)
+    alone = compare_trials({"open loop": []} | own, MAPS, STUDY, 1e-4)
+    kept = {key: value for key, value in both.quantities.items() if key.startswith("S25.")}
+    assert alone.quantities == kept and len(kept) == 3
+    assert alone.reason("S24.rise_open") == "not played (steps.open_trials = 0)"
+    with pytest.raises(InputError, match=r"not played .* controller 'mine': response moves by"):
+        compare_trials({"open loop": [], OWN: trials(-0.5)}, MAPS, STUDY, 1e-4)
+
+
 def test_the_open_loop_is_needed() -> None:
     with pytest.raises(InputError, match="response moves by -"):
         compare_trials({"open loop": trials(-0.5), "PI": trials(1.0)}, MAPS, STUDY, 1e-4)

@@ -34,6 +34,7 @@ from haselab.controllers import (
     ControllerSetting,
     known_actuator,
 )
+from haselab.models.maps import allow_start
 from haselab.models.posterior import PlantPosterior
 from haselab.pipelines.design.answer import (
     design_answer,
@@ -198,8 +199,26 @@ def _own_design(
             (loop["delay_s"], stated[1], usual.measurement_delay_s),
         )
     )
-    strains = (-math.inf, math.inf) if actuator is None else actuator.reachable()
-    low, high = strains
+    low, high = strains = (-math.inf, math.inf)
+    if actuator is not None:
+        low, high = actuator.reachable()
+        if not allow_start((low, high)):
+            raise ResultError(
+                f"A loop starts at zero strain, but by the physical model the drive of "
+                f"{actuator.low_v:g} to {actuator.high_v:g} V reaches strains of {low:.3g} to "
+                f"{high:.3g}. Change the limits of the drive, or define zero strain as the length "
+                "at a drive within these limits (zero_length_m) and fit the maps and the model "
+                f"again. {model}"
+            )
+        strains = actuator.sensed_range()
+        if strains != (low, high):
+            click.echo(
+                f"haselab: The limits are strains of {strains[0]:.3g} to {strains[1]:.3g} instead "
+                f"of {low:.3g} to {high:.3g}, which the drive reaches: beyond, the drive is near "
+                "0 V, where the pouches are slack and the capacitance hardly depends on the "
+                f"length. {model}",
+                err=True,
+            )
     if actuator is not None and kind.output == "voltage":
         low, high = actuator.low_v, actuator.high_v
     setting = ControllerSetting(1.0 / rate_hz, low, high, delay_s=delay_s, actuator=actuator)

@@ -41,6 +41,7 @@ class LoopModel:
         capacitance_f: a capacitance in the range of the map; 0: unknown.
         alternates: whether the sign of the drive alternates on purpose.
         resonance_rad_s: highest natural frequency of the actuator; 0: unknown.
+        slack_f: capacitance at 0 V of an actuator whose pouches are slack there; 0: it has none.
     """
 
     block_s: float
@@ -58,6 +59,7 @@ class LoopModel:
     capacitance_f: float
     alternates: bool = False
     resonance_rad_s: float = 0.0
+    slack_f: float = 0.0
 
     @property
     def range(self) -> float:
@@ -68,10 +70,24 @@ class LoopModel:
     def quickness(self) -> float:
         """How much more than a slow actuator's the rate of strain may change from block to block.
 
-        After a step by x without damping, it changes by $2 x (1 - \\cos\\omega T)$ at most.
+        It is for motion without a change of the drive; `rate_change` adds what the drive explains.
         """
-        turned = min(self.resonance_rad_s * self.block_s, math.pi)
-        return min(max((1.0 - math.cos(turned)) / _SLOW, 1.0), _MOST_QUICK)
+        return min(max(0.5 * self.rate_change(1.0) / _SLOW, 1.0), _MOST_QUICK)
+
+    def rate_change(self, step: float, blocks: int = 1) -> float:
+        """Largest change of the rate of strain, per block, after a step of the drive.
+
+        Without damping, the second difference is $2 x (1 - \\cos\\omega T)$ at most. A controller
+        that puts out a voltage steps farther than its reference.
+
+        Args:
+            step: x, of the static strain.
+            blocks: between two measured strains.
+        Returns:
+            The change; 0 if the resonance is not known.
+        """
+        turned = min(self.resonance_rad_s * self.block_s * blocks, math.pi)
+        return 2.0 * step * (1.0 - math.cos(turned)) / blocks
 
 
 def loop_model(
@@ -84,6 +100,7 @@ def loop_model(
     capacitance_f: float = 0.0,
     alternates: bool = False,
     resonance_rad_s: float = 0.0,
+    slack_f: float = 0.0,
 ) -> LoopModel:
     """Build the model of a loop on a rig.
 
@@ -97,6 +114,7 @@ def loop_model(
         capacitance_f: see `LoopModel`.
         alternates: see `LoopModel`.
         resonance_rad_s: see `LoopModel`.
+        slack_f: see `LoopModel`.
     """
     low, high = min(saturation[0], 0.0), max(saturation[1], 0.0)
     strain = np.linspace(low, high, _GRID)
@@ -121,6 +139,7 @@ def loop_model(
         capacitance_f=capacitance_f,
         alternates=alternates,
         resonance_rad_s=resonance_rad_s,
+        slack_f=slack_f,
     )
 
 

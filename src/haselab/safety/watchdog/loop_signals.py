@@ -15,6 +15,7 @@ __all__ = ["WINDOW_S", "Delay", "Jumps", "Plausible", "Repeats", "Swings"]
 
 WINDOW_S = 0.5
 _MEMORY_S = 1.0  # window in which a value must not repeat often
+_SLACK = 0.05  # relative difference from the capacitance of slack pouches
 _CHATTER_S = 0.2
 _SLOW_S = 3.0
 _SCATTER = 6.0  # a single change may exceed its limit by this multiple of the recent RMS
@@ -33,7 +34,7 @@ class Plausible:
     def __init__(self, model: LoopModel, settings: WatchdogSettings) -> None:
         margin = settings.range_margin * model.range
         self._low, self._high = model.strain_low - margin, model.strain_high + margin
-        self._farad = (0.0, math.inf)
+        self._farad, self._slack_f = (0.0, math.inf), model.slack_f
         if model.capacitance_map is not None:
             self._farad = capacitance_range(
                 model.capacitance_map, self._low, self._high, model.capacitance_f
@@ -42,6 +43,16 @@ class Plausible:
     def fault(self, strain: float, capacitance_f: float | None) -> str:
         """Return why the loop must stop, or an empty text; missing values (NaN) are ignored."""
         low_f, high_f = self._farad
+        if capacitance_f is not None and abs(capacitance_f - self._slack_f) < min(
+            _SLACK * self._slack_f, low_f - self._slack_f
+        ):
+            return (
+                f"Capacitance out of range: {capacitance_f:.4g} F, but the strain map covers "
+                f"{low_f:.3g} to {high_f:.3g} F. The pouches of this actuator have "
+                f"{self._slack_f:.3g} F at 0 V, where they are slack at any length: keep the "
+                "desired strain away from that of 0 V, or design the controller again. If the "
+                "drive was not near 0 V, check the monitors and their cables."
+            )
         if capacitance_f is not None and not low_f <= capacitance_f <= high_f:
             return (
                 f"Capacitance out of range: {capacitance_f:.4g} F, but the strain map covers "
@@ -87,19 +98,34 @@ class Repeats:
 
 
 class Jumps:
-    """Check changes of the strain rate, which the actuator's inertia limits."""
+    """Check changes of the strain rate, which the actuator's inertia limits.
 
-    def __init__(self, model: LoopModel, settings: WatchdogSettings) -> None:
+    Args:
+        model: of the loop.
+        settings: limits.
+        rest: static strain of the drive before the loop closes; None: unknown.
+    """
+
+    def __init__(
+        self, model: LoopModel, settings: WatchdogSettings, rest: float | None = None
+    ) -> None:
+        self._model = model
         self._limit = settings.jump_share * model.range * model.quickness
         self._chatter = settings.chatter_share * model.range * model.quickness
         count = max(round(_CHATTER_S / model.block_s), 8)
         self._squares: deque[float] = deque(maxlen=count)
         self._sum = 0.0
         self._last: list[float] = []
+        self._statics = deque([] if rest is None else [rest], maxlen=count)
+        self._explained: deque[float] = deque(maxlen=count)  # of each square
 
     def clear(self) -> None:
         """Restart: the next value does not follow the last one."""
         self._last = []
+
+    def driven(self, static: float) -> None:
+        """Note the static strain of the drive in force, in every block."""
+        self._statics.append(static)
 
     def fault(self, strain: float, blocks: int) -> str:
         """Return why the loop must stop, or an empty text; `blocks` have passed since the last."""
@@ -111,7 +137,9 @@ class Jumps:
         change = abs(a - 2.0 * b + c) / blocks
         squares = self._squares
         scatter = math.sqrt(max(self._sum, 0.0) / len(squares)) if len(squares) > 7 else 0.0
-        allowed = self._limit + _SCATTER * scatter
+        step = max(self._statics) - min(self._statics) if self._statics else 0.0
+        explained = self._model.rate_change(step, blocks)
+        allowed = max(self._limit, explained) + _SCATTER * scatter
         if len(squares) == squares.maxlen:
             self._sum -= squares[0]
         squares.append(change * change)
@@ -122,10 +150,12 @@ class Jumps:
                 f"block (limit {allowed:.2g}). Check the sensor and its cables."
             )
         chatter = math.sqrt(max(self._sum, 0.0) / len(squares))
-        if len(squares) == squares.maxlen and chatter > self._chatter:
+        self._explained.append(explained)
+        most = max(self._chatter, math.sqrt(0.5) * max(self._explained))  # RMS of a sine
+        if len(squares) == squares.maxlen and chatter > most:
             return (
                 f"Strain alternates: its rate changes by {chatter:.2g} per block (RMS; limit "
-                f"{self._chatter:.2g}). Check the sensor; lower the gains."
+                f"{most:.2g}). Check the sensor; lower the gains."
             )
         return ""
 

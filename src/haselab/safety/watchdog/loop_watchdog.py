@@ -103,7 +103,8 @@ class LoopWatchdog:
             settings.repeat_s,
             "The sensor is frozen, or its steps are too coarse. Check camera, monitors and cables.",
         )
-        self._jumps = Jumps(model, settings)
+        rest = None if before_v is None else self._static(before_v)
+        self._jumps = Jumps(model, settings, rest)
         # The loop's first output is a step from equilibrium. A sensing chain without blanking
         # mistakes that step for a change of strain, in the block in which it leaves the queue.
         self._stepping = model.queued + 1
@@ -118,7 +119,7 @@ class LoopWatchdog:
             settings.response_share,
             settings.direction_ratio,
             max(1, round(WINDOW_S / POINTS / model.block_s)),
-            None if before_v is None else self._static(before_v),
+            rest,
             settled,
         )
         self._lost: deque[bool] = deque(maxlen=max(round(WINDOW_S / model.block_s), 2))
@@ -140,7 +141,8 @@ class LoopWatchdog:
         )
 
     def _sensor(self, sample: LoopSample) -> str:
-        strain = sample.strain
+        strain, static = sample.strain, self._static(sample.drive_v)
+        self._jumps.driven(static)
         if self._changes_sign(sample.drive_v):
             self._held += 1
             self._lost.append(True)
@@ -157,11 +159,7 @@ class LoopWatchdog:
             if not fault and not stepping:
                 fault = self._jumps.fault(strain, self._held)
         self._held = 1 if sample.fresh else self._held + 1
-        return (
-            fault
-            or self._late(sample)
-            or self._reaction.fault(self._static(sample.drive_v), strain)
-        )
+        return fault or self._late(sample) or self._reaction.fault(static, strain)
 
     def _changes_sign(self, drive_v: float) -> bool:
         """Whether an alternating voltage passes zero in this block, so that it gives no strain."""

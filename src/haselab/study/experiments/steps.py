@@ -7,7 +7,7 @@ from dataclasses import replace
 
 import numpy as np
 
-from haselab.base import ResultError
+from haselab.base import InputError, ResultError
 from haselab.controllers import KnownActuator
 from haselab.rig import RigDescription
 from haselab.runtime.loop import LoopSettings
@@ -105,6 +105,14 @@ class StepTest(Experiment[Steps]):
             carrier_v = self.settings.paper_chain_carrier_v
             drives.append(Drive(name, values_v, carrier_v=carrier_v))
         return drives
+
+    def check(self) -> None:
+        """See `Experiment`: the trials in open loop that the fit of the chirp needs."""
+        if not self.settings.open_trials and self.study.has("chirp"):
+            raise InputError(
+                "steps.open_trials is 0, but the fit of [chirp] needs trials in open loop. Use at "
+                "least 1, or remove [chirp]."
+            )
 
     def seconds(self, rig: RigDescription) -> float:
         """See `Experiment`."""

@@ -232,7 +232,9 @@ def _figures(
     }
 
 
-def require_open_steps(to_volt: VoltageMap, step: float, low_v: float, high_v: float) -> None:
+def require_open_steps(
+    to_volt: VoltageMap, step: float, low_v: float, high_v: float, closed: str = ""
+) -> None:
     """Refuse open-loop steps that the drive does not reach through the voltage map.
 
     Args:
@@ -241,6 +243,7 @@ def require_open_steps(to_volt: VoltageMap, step: float, low_v: float, high_v: f
             zero strain is just outside, see `allow_start`.
         low_v: lowest drive, in V.
         high_v: highest drive, in V.
+        closed: what the message says of the closed loop.
     Raises:
         InputError: the voltage of zero strain, or of the step, is not within the drive.
     """
@@ -258,7 +261,13 @@ def require_open_steps(to_volt: VoltageMap, step: float, low_v: float, high_v: f
         return
     reach = to_volt.reach((min(step, 0.0), max(step, 0.0)), low_v, high_v) or (0.0, 0.0)
     farthest = reach[0] if step < 0.0 else reach[1]
+    fitted = to_volt.strain_low <= step <= to_volt.strain_high
+    beyond = "" if fitted else (
+        f" (extrapolated: the map is for strains of {to_volt.strain_low:.3g} to "
+        f"{to_volt.strain_high:.3g})"
+    )  # fmt: skip
     raise InputError(
-        f"step = {step:g} in [steps] is a strain that needs {step_v:.4g} V by the voltage map, but "
-        f"{ends}. Choose a step between 0 and {farthest:.3g}."
+        f"step = {step:g} in [steps] is a strain that needs {step_v:.4g} V by the voltage map"
+        f"{beyond}, but {ends}. Choose a step between 0 and {farthest:.3g}"
+        f"{' for the trials in open loop' * bool(closed)}.{f' {closed}' * bool(closed)}"
     )

@@ -154,7 +154,7 @@ def compare_trials(
     """Compare open loop and closed loop.
 
     Args:
-        observed: trials by group: "open loop" and, if they were played, "PI", "PID" and `OWN`.
+        observed: trials by group: "open loop", and, if they were played, "PI", "PID" and `OWN`.
         maps: zero strain, capacitance to strain.
         study: the step.
         scale_m_per_px: of the camera, for its resolution.
@@ -162,12 +162,15 @@ def compare_trials(
         Results S24 and S25, data for figure 6 and for the comparison of self-sensing and camera.
         A closed loop whose trials cannot be evaluated costs its own results alone.
     Raises:
-        InputError: the trials in open loop cannot be evaluated.
+        InputError: the trials in open loop, or all trials, cannot be evaluated.
     Source: reference study, rows S24 and S25.
     """
     groups: dict[str, Trials] = {}
     failed: dict[str, str] = {}
     for name, trials in observed.items():
+        if not trials:
+            failed[name] = "not played (steps.open_trials = 0)"
+            continue
         try:
             groups[name] = collect_trials(trials, maps.length_m, maps.strain_map, study.steps)
         except InputError as error:
@@ -175,12 +178,16 @@ def compare_trials(
                 raise
             shown = f"the controller {study.control.kind!r}" if name == OWN else name
             failed[name] = f"step trials with {shown}: {error}"
-    opened = groups["open loop"].metrics
-    quantities = {
-        "S24.rise_open": opened.rise_time_s,
-        "S24.rise_open_raw": opened.raw_rise_time_s,
-        "S24.error_open": opened.steady_state_error,
-    }
+    if not groups:
+        raise InputError("; ".join(failed.values()))
+    quantities: dict[str, Estimate] = {}
+    if "open loop" in groups:
+        opened = groups["open loop"].metrics
+        quantities |= {
+            "S24.rise_open": opened.rise_time_s,
+            "S24.rise_open_raw": opened.raw_rise_time_s,
+            "S24.error_open": opened.steady_state_error,
+        }
     if "PI" in groups:
         closed = groups["PI"].metrics
         quantities |= {

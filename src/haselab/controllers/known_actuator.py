@@ -295,7 +295,7 @@ class KnownActuator:
     @cached_property
     def _last_sensed(self) -> float | None:
         """Strain nearest to that of the lowest drive that loops can sense; None: all of them."""
-        if len(self.table.pull_n_v2) == 1:  # the capacitance does not depend on the voltage
+        if not self.capacitance_follows_drive:
             return None
         low, high = self.reachable()
         strains = np.linspace(*((low, high) if self.elongates else (high, low)), _SENSED_POINTS)
@@ -304,6 +304,11 @@ class KnownActuator:
         end = float(strains[np.argmax(pulls >= share * pulls[-1])])
         driven, idle = (self._per_length(end, v) for v in (self.static_drive_v(end), self.low_v))
         return end if _BLIND * idle < driven else None
+
+    @property
+    def capacitance_follows_drive(self) -> bool:
+        """Whether the capacitance at one length depends on the voltage, as that of pouches."""
+        return len(self.table.pull_n_v2) > 1
 
     @cached_property
     def slack_f(self) -> float:

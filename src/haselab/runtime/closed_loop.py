@@ -231,6 +231,7 @@ def _watchdog(rig: GuardedRig, carrier: tuple[float, float], loop: LoopSettings)
         loop.controller.kind.alternates,
         _resonance_rad_s(loop),
         0.0 if loop.actuator is None else loop.actuator.slack_f,
+        loop.actuator is not None and loop.actuator.capacitance_follows_drive and not by_video,
     )
     return LoopWatchdog(
         model, settings.loop, settings.rating, rig.present_drive_v, rig.bench.is_settled

@@ -42,6 +42,8 @@ class LoopModel:
         alternates: whether the sign of the drive alternates on purpose.
         resonance_rad_s: highest natural frequency of the actuator; 0: unknown.
         slack_f: capacitance at 0 V of an actuator whose pouches are slack there; 0: it has none.
+        follows_drive: whether the sensed strain also follows a change of the drive at once, because
+            the capacitance of the actuator depends on the voltage.
     """
 
     block_s: float
@@ -60,6 +62,7 @@ class LoopModel:
     alternates: bool = False
     resonance_rad_s: float = 0.0
     slack_f: float = 0.0
+    follows_drive: bool = False
 
     @property
     def range(self) -> float:
@@ -101,6 +104,7 @@ def loop_model(
     alternates: bool = False,
     resonance_rad_s: float = 0.0,
     slack_f: float = 0.0,
+    follows_drive: bool = False,
 ) -> LoopModel:
     """Build the model of a loop on a rig.
 
@@ -115,6 +119,7 @@ def loop_model(
         alternates: see `LoopModel`.
         resonance_rad_s: see `LoopModel`.
         slack_f: see `LoopModel`.
+        follows_drive: see `LoopModel`.
     """
     low, high = min(saturation[0], 0.0), max(saturation[1], 0.0)
     strain = np.linspace(low, high, _GRID)
@@ -140,6 +145,7 @@ def loop_model(
         alternates=alternates,
         resonance_rad_s=resonance_rad_s,
         slack_f=slack_f,
+        follows_drive=follows_drive,
     )
 
 

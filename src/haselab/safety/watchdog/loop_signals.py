@@ -17,6 +17,7 @@ WINDOW_S = 0.5
 _MEMORY_S = 1.0  # window in which a value must not repeat often
 _SLACK = 0.05  # relative difference from the capacitance of slack pouches
 _CHATTER_S = 0.2
+_RECENT = 4  # blocks, besides queued ones, whose drives act on three strains in a row
 _SLOW_S = 3.0
 _SCATTER = 6.0  # a single change may exceed its limit by this multiple of the recent RMS
 _ASKED = 2  # reversals of the drive explained by one of the reference: there, and back
@@ -123,6 +124,11 @@ class Jumps:
         """Restart: the next value does not follow the last one."""
         self._last = []
 
+    def _driven_at_once(self) -> float:
+        """Largest second difference of the drive's static strain in the last blocks."""
+        recent = list(self._statics)[-_RECENT - self._model.queued :]
+        return float(np.abs(np.diff(recent, 2)).max(initial=0.0)) if len(recent) > 2 else 0.0
+
     def driven(self, static: float) -> None:
         """Note the static strain of the drive in force, in every block."""
         self._statics.append(static)
@@ -139,6 +145,8 @@ class Jumps:
         scatter = math.sqrt(max(self._sum, 0.0) / len(squares)) if len(squares) > 7 else 0.0
         step = max(self._statics) - min(self._statics) if self._statics else 0.0
         explained = self._model.rate_change(step, blocks)
+        if self._model.follows_drive:
+            explained += self._driven_at_once() / blocks
         allowed = max(self._limit, explained) + _SCATTER * scatter
         if len(squares) == squares.maxlen:
             self._sum -= squares[0]

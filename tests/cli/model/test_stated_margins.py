@@ -154,6 +154,8 @@ def test_a_changed_delay_of_the_loop_is_noticed(
     changed(leg, ("loop_delay_s = 0.00751", "loop_delay_s = 0.02"))
     assert run(capsys, "design", leg)[0] == 0
     assert run(capsys, "report", leg)[2] == ""
+    changed(leg, ("loop_delay_s = 0.02\n", ""))  # the design alone states a delay
+    assert run(capsys, "report", leg)[2] == ""
     arguments = ("--rate-hz", 1000, "--delay-s", 0.0018, "--accept-shortfalls")
     assert run(capsys, "design", leg, *arguments)[0] == 0  # another rate has its own delay
     assert run(capsys, "report", leg)[2] == ""

@@ -77,11 +77,14 @@ def delay_doubt(path: Path, kind: str | None = None) -> str:
     Returns:
         What is wrong and what to do; empty if the delays or the margins are the same.
     """
-    section = read_tables(path).controller
+    tables = read_tables(path)
+    section = tables.controller
     held = section if kind is None or section is None else section.all_kinds.get(kind)
     file = path / ACTUATOR if path.is_dir() else path
     if held is None or held.loop is None or not file.exists():
         return ""
+    if tables.model is None or tables.model.loop_delay_s is None:
+        return ""  # the design alone states a delay
     rate_hz, delay_s = loop_of(file, None, None)
     own_hz, own_s = _loop_of(held, file)
     if rate_hz != own_hz or math.isclose(delay_s, own_s, rel_tol=_SAME):

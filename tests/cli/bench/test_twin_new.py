@@ -70,9 +70,9 @@ def test_it_prints_toml_or_json(capsys) -> None:
     ("arguments", "words"),
     [
         (("--kind", "muscle"), "No actuator 'muscle' is registered. Use one of "),
-        (("--set", "shell.length_m"), "is not KEY=VALUE"),
-        (("--set", "length_m=3"), "is not KEY=VALUE"),
-        (("--set", "shell.length_m=long"), "is not KEY=VALUE"),
+        (("--set", "shell.length_m"), "is not SECTION.KEY=VALUE"),
+        (("--set", "length_m=3"), "is not SECTION.KEY=VALUE"),
+        (("--set", "shell.length_m=long"), "is not SECTION.KEY=VALUE"),
         (("--set", "name.x=1"), "name is not a section. Use --name"),
         (("--set", "shell.length_m=3"), "less than 0.2 (got 3)"),
         (("--kind", "dea-stack", "--set", "actuator.layers=0"), "outside [1, 100000]"),

@@ -7,7 +7,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from haselab.actuators import GRAVITY_M_S2, DeaStack, Drive, SampledLaw
+from haselab.actuators import GRAVITY_M_S2, DeaStack, Drive, SampledLaw, measured_parameters
 from haselab.base import InputError
 from haselab.cli.identify.common import refuse_copies
 from haselab.cli.main import main
@@ -54,6 +54,7 @@ def actuator(tmp_path):
     return path
 
 
+ASSUMED = "haselab: defaults of the kind dea-stack, which are not fitted: actuator.layers = 50"
 COLUMNS = ("--time", "Zeit", "--input", "U", "--output", "length_m", "--output", "C")
 
 
@@ -89,7 +90,8 @@ def test_two_tables_of_two_masses_give_the_law(actuator, tmp_path, capsys):
 @pytest.mark.long
 def test_each_parameter_and_linear_model_is_one_readable_line(actuator, tmp_path, capsys):
     file, out = table(tmp_path / "a.csv", 0.3), tmp_path / "answer.json"
-    code, text, _ = run(capsys, file, "--actuator", actuator, *COLUMNS, "--out", out)
+    code, text, err = run(capsys, file, "--actuator", actuator, *COLUMNS, "--out", out)
+    assert ASSUMED in err
     answer, lines = json.loads(out.read_text()), text.splitlines()
     assert code == 0 and max(map(len, lines)) <= 120
     sources = answer["determined_by"]["actuator.permittivity"]
@@ -101,6 +103,20 @@ def test_each_parameter_and_linear_model_is_one_readable_line(actuator, tmp_path
     assert len(shown) == len(models) == 5
     pole = max(models[0]["poles"], key=lambda one: one[1])
     assert f"{pole[0]:.4g} ± {pole[1]:.4g}i" in shown[0]
+
+
+def test_dimensions_that_are_stated_are_not_named_as_defaults(actuator, tmp_path, capsys):
+    law = DeaStack()
+    assert actuator.read_text().startswith(HEADER)
+    dimensions = "".join(f'"{k}" = {v}\n' for k, v in measured_parameters(law).items())
+    actuator.write_text(f"{actuator.read_text()}\n[actuator.parameters]\n{dimensions}")
+    file = table(tmp_path / "few.csv", 0.3, rows=100)
+    file.write_text("\n".join(file.read_text().splitlines()[:8]))  # too few for a search
+    code, _, err = run(capsys, file, "--actuator", actuator, *COLUMNS)
+    assert code == 3 and "defaults of the kind" not in err
+    actuator.write_text(actuator.read_text().replace('"actuator.layers" = 50.0\n', ""))
+    code, _, err = run(capsys, file, "--actuator", actuator, *COLUMNS)
+    assert code == 3 and f"{ASSUMED}. State what you measured in [actuator.parameters]." in err
 
 
 @pytest.mark.long

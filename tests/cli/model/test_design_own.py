@@ -57,6 +57,14 @@ def test_a_kind_with_a_design_writes_its_parameters_into_the_actuator_file(tmp_p
     assert "peak sensitivity is at most 1.8" in answer["robustness"]
 
 
+def test_a_physical_model_with_an_error_gives_a_warning(tmp_path, capsys):
+    file = tmp_path / "A.toml"
+    file.write_text(FILE + 'status = "model error: lengths are off"\n')
+    code, _, err = run(capsys, "design", file, "--controller", "force", "--delay-s", 0.0056)
+    said = "the status of [model.physical], which the design uses, is: model error: lengths are off"
+    assert code == 0 and err == f"haselab: warning: {said}. {file}\n"
+
+
 CURLING = """
 [actuator]
 name = "strip"

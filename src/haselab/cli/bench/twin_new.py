@@ -77,8 +77,8 @@ def _data(kind: str, name: str, values: Sequence[str]) -> dict[str, Any]:
             parsed = None
         if not (equals and dot and section and entry) or parsed is None:
             raise InputError(
-                f"--set {given} is not KEY=VALUE. Use a key such as shell.length_m, and a number "
-                "or a list of numbers as the value."
+                f"--set {given} is not SECTION.KEY=VALUE. Use a key such as shell.length_m or "
+                "actuator.cells, and a number or a list of numbers as the value."
             )
         table = data.setdefault(section, {})
         if not isinstance(table, dict):

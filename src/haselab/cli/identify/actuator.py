@@ -134,6 +134,7 @@ def actuator(
     refuse_copies(files, [record.capacitance_f for record in records])
     _warn_of_stated(files, records, gains_v_per_v, tables, actuator)
     tracked = all(file.is_dir() or is_session(file) for file in files)
+    _note_assumed(law, tables.actuator, actuator)
     with waiting("search for the physical model"):
         fit = fit_actuator(
             law, records, mass_kg=mass_kg, added_inertia_kg=added_inertia_kg,
@@ -237,6 +238,19 @@ def _proposals(
     unknown = [name for name in fit.not_identifiable if planner.before()[name] > DETERMINED]
     found = (planner.propose(name, pairs=False) for name in unknown)
     return [proposal for proposal in found if proposal is not None]
+
+
+def _note_assumed(law: ActuatorLaw, section: ActuatorSection | None, path: Path) -> None:
+    """Say which dimensions are defaults of the kind, because the fit does not change them."""
+    stated = {} if section is None else section.parameters
+    assumed = {k: v for k, v in measured_parameters(law).items() if k not in stated}
+    if assumed:
+        values = ", ".join(f"{name} = {value:g}" for name, value in assumed.items())
+        click.echo(
+            f"haselab: defaults of the kind {law.kind}, which are not fitted: {values}. State what "
+            f"you measured in [actuator.parameters]. {path}",
+            err=True,
+        )
 
 
 def law_of_section(section: ActuatorSection | None, path: Path) -> ActuatorLaw:

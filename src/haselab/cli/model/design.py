@@ -189,6 +189,13 @@ def _own_design(
         )
     tables = load_actuator(model)
     actuator, usual = known_actuator(tables, model), LoopSetting()
+    physical = None if tables.model is None else tables.model.physical
+    if physical is not None and physical.status != "ok":
+        click.echo(
+            f"haselab: warning: the status of [model.physical], which the design uses, is: "
+            f"{physical.status}. {model}",
+            err=True,
+        )
     stated = (None, None) if tables.model is None else (
         tables.model.rate_hz, tables.model.loop_delay_s
     )  # fmt: skip

@@ -118,8 +118,7 @@ class KnownActuator:
 
     def static_capacitance_f(self, strain: float) -> float:
         """Capacitance while a strain is held for long, in F, without the error of sensing."""
-        drive_v = min(self.static_drive_v(strain), max(self.high_v, -self.low_v))
-        return float(self.law.capacitance_f(self.length_m(strain), self.gain_v_per_v * drive_v))
+        return float(self.law.capacitance_f(self.length_m(strain), self._holding_v(strain)))
 
     def length_noise_m(self, strain: float) -> float:
         """Standard deviation of a sensed length while its strain is held for long.
@@ -129,14 +128,18 @@ class KnownActuator:
         """
         if math.isnan(self.capacitance_noise_f):
             return _USUAL_NOISE * self.zero_length_m
-        drive_v = min(self.static_drive_v(strain), max(self.high_v, -self.low_v))
         length_m, step_m = self.length_m(strain), self.table.step_m
         near = np.array([length_m - step_m, length_m + step_m])
-        ends = self.law.capacitance_f(near, self.gain_v_per_v * drive_v)
+        ends = self.law.capacitance_f(near, self._holding_v(strain))
         change_f = abs(float(ends[1] - ends[0])) * self.sensing_scale
         any_m = float(self._lengths_m[-1] - self._lengths_m[0]) / math.sqrt(12.0)
         noise = 2.0 * step_m * self.capacitance_noise_f
         return any_m if noise >= any_m * change_f else noise / change_f
+
+    def _holding_v(self, strain: float) -> float:
+        """Voltage at the actuator that holds a strain for long, at most the highest one, in V."""
+        drive_v = min(self.static_drive_v(strain), max(self.high_v, -self.low_v))
+        return self.gain_v_per_v * drive_v
 
     # ---- forces ------------------------------------------------------------------------------
 

@@ -18,12 +18,16 @@ from haselab.control.candidates import Task, plant_crossover, score
 from haselab.control.charts import step_chart
 from haselab.control.gains import PidGains
 from haselab.control.plants.general import AnyPlant, PlantScale
-from haselab.control.plants.general_loops import closed_loop_poles, trace_general
+from haselab.control.plants.general_loops import (
+    closed_loop_poles,
+    plant_output,
+    trace_general,
+)
 from haselab.control.plants.modes import SampledLoops
 from haselab.control.reach import integrates
 from haselab.control.simulate import LoopSetting, simulate_loop
 from haselab.control.spec import DesignSpec
-from haselab.control.stability.margins import Margins, margins
+from haselab.control.stability.margins import Margins, loop_margins
 from haselab.control.stability.plausible import PlausibleMargins
 from haselab.control.step_metrics import StepNumbers, step_metrics
 from haselab.models.plant import Plant
@@ -77,7 +81,8 @@ class Design:
         spec: the specification.
         setting: rate, measurement delay and saturation that it was designed for.
         nominal: prediction for the given plant.
-        spread: predictions over the spread of natural frequency, the nominal one first.
+        spread: predictions over the spread of natural frequency and direct share, the nominal one
+            first.
         shortfalls: unmet demands, as text; empty if all are met.
         plant: that it was designed for.
         plausible: margins on plants drawn from the posterior; None without one.
@@ -231,7 +236,7 @@ def predict(
         >>> round(found.step.rise_time_s, 1), found.margins.stable
         (0.7, True)
     """
-    found = margins(plant, gains, loop_delay_s=setting.measurement_delay_s, rate_hz=setting.rate_hz)
+    found = loop_margins(plant, gains, setting)
     if not found.stable:
         nothing = StepNumbers(*[math.nan] * len(dataclasses.fields(StepNumbers)))
         return Prediction(_frequency(plant), found, nothing, math.nan)
@@ -250,7 +255,13 @@ def _slowest_s(plant: AnyPlant, gains: PidGains, setting: LoopSetting) -> float:
     """Longest time constant of the closed loop, in s."""
     period_s, delay_s = 1.0 / setting.rate_hz, setting.measurement_delay_s
     if isinstance(plant, Plant):
-        loops = SampledLoops.of([plant], [gains], period_s=period_s, measurement_delay_s=delay_s)
+        loops = SampledLoops.of(
+            [plant],
+            [gains],
+            period_s=period_s,
+            measurement_delay_s=delay_s,
+            direct_share=setting.direct_share,
+        )
         poles = loops.poles()[0]
     else:
         poles = closed_loop_poles(plant, [gains], setting)[0]
@@ -271,7 +282,8 @@ def _simulated(
     if not isinstance(plant, Plant):
         measured, u = trace_general(plant, [gains], reference, setting)
         time_s = np.arange(reference.size) / setting.rate_hz
-        general = step_metrics(time_s, measured[0], reference, reaches=reaches).trials[0]
+        output = plant_output(plant, measured[0], u[0], setting)
+        general = step_metrics(time_s, output, reference, reaches=reaches).trials[0]
         return general, float(np.abs(u).max())
     trace = simulate_loop(plant, gains, reference, setting)
     desired = np.repeat(reference, setting.points_per_sample)
@@ -406,8 +418,8 @@ def evaluate_gains(task: Task, gains: PidGains) -> Design:
         The gains with their predictions, as those of a design.
     """
     spread = tuple(
-        predict(plant, gains, task.setting, step=task.step, record_s=task.horizon_s())
-        for plant in task.plants()
+        predict(plant, gains, setting, step=task.step, record_s=task.horizon_s())
+        for plant, setting in task.variants()
     )
     spec = dataclasses.replace(task.spec, step=task.step, noise_gain=task.noise_gain)
     shortfalls = _shortfalls(task, gains, spread)
@@ -508,8 +520,8 @@ def _shortfalls(task: Task, gains: PidGains, spread: tuple[Prediction, ...]) -> 
         within = spec.rise_time_tolerance + 0.01
         if not abs(rise_s / spec.rise_time_s - 1.0) <= within:
             short.append(("rise time in s", rise_s, f"{spec.rise_time_s:g} within {within:.0%}"))
-    for item, plant in zip(spread, task.plants(), strict=True):
-        own = plant_crossover(plant, task.setting)
+    for item, (plant, setting) in zip(spread, task.variants(), strict=True):
+        own = plant_crossover(plant, setting)
         if spec.keep_crossover and not item.margins.crossover_rad_s >= 0.99 * own:
             got = item.margins.crossover_rad_s
             short.append(("crossover in rad/s", got, f"{own:.3g} or more"))

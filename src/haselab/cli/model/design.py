@@ -21,13 +21,15 @@ from haselab.control import (
     Design,
     DesignSpec,
     LoopSetting,
+    Saturation,
     design_controller,
-    margins,
 )
 from haselab.control.charts import loop_chart
+from haselab.control.direct_share import with_direct_share
 from haselab.control.gains import gain_units
 from haselab.control.plants.general import AnyPlant
 from haselab.control.plausible_design import USUAL_STRUCTURE
+from haselab.control.stability.margins import loop_margins
 from haselab.controllers import (
     CONTROLLERS,
     ControllerKind,
@@ -48,6 +50,7 @@ from haselab.pipelines.design.model_file import (
     read_loop,
     read_origin,
     read_posterior,
+    read_tables,
 )
 from haselab.pipelines.design.sections import (
     CONTROLLER_KEYS,
@@ -140,7 +143,7 @@ def command(
     limits = limits_of(model, loop["limits"])
     if note := default_limits_note(model, loop["limits"], limits):
         click.echo(f"haselab: {note}", err=True)
-    setting = LoopSetting(rate_hz, delay_s, limits)
+    setting = _setting(model, rate_hz, delay_s, limits)
     if posterior is None and loop["probability"] is not None:
         raise InputError(
             f"--probability {loop['probability']:g} needs the covariance of the model, which the "
@@ -286,9 +289,9 @@ def _judge(
     if note := default_note(model, kind):
         click.echo(f"haselab: {note}", err=True)
     rate_hz, delay_s = loop_of(model, loop["rate_hz"], loop["delay_s"])
-    setting = LoopSetting(rate_hz, delay_s, limits_of(model, loop["limits"]))
+    setting = _setting(model, rate_hz, delay_s, limits_of(model, loop["limits"]))
     plant, feedback = read_any_plant(model), feedback_of(held, rate_hz)
-    found = margins(plant, feedback, loop_delay_s=delay_s, rate_hz=rate_hz)
+    found = loop_margins(plant, feedback, setting)
     if not found.stable:
         raise ResultError(
             f"The loop with the controller {kind!r} is unstable with a delay of {delay_s:g} s. "
@@ -307,6 +310,14 @@ def _judge(
     _save(model, out, section, None)
     emit(answer | {"parameters": held.parameters, "searched": False}, as_json=as_json, out=None)
     save_plot(plot, lambda: loop_chart(plant, feedback, setting, found.crossover_rad_s))
+
+
+def _setting(model: Path, rate_hz: float, delay_s: float, limits: Saturation) -> LoopSetting:
+    """The loop of a model; that of an actuator file with its direct share."""
+    setting = LoopSetting(rate_hz, delay_s, limits)
+    if model.suffix.lower() != ".toml":
+        return setting
+    return with_direct_share(setting, read_tables(model))
 
 
 def _save(model: Path, out: Path | None, section: dict[str, object], spec: Path | None) -> None:

@@ -11,11 +11,13 @@ from haselab.cli.common import REAL, answer_options, emit
 from haselab.cli.model.loop_options import loop_options
 from haselab.cli.options import shared_option
 from haselab.cli.plot import save_plot
-from haselab.control import LinearController, LoopSetting, PidGains, margins
+from haselab.control import LinearController, LoopSetting, PidGains
 from haselab.control.charts import loop_chart
+from haselab.control.direct_share import with_direct_share
+from haselab.control.stability.margins import loop_margins
 from haselab.pipelines.design.answer import margins_answer
 from haselab.pipelines.design.feedback import default_note, feedback_of, read_controller
-from haselab.pipelines.design.model_file import loop_of, read_any_plant
+from haselab.pipelines.design.model_file import loop_of, read_any_plant, read_tables
 
 __all__ = ["command"]
 
@@ -69,6 +71,8 @@ def command(
     loop = None if held is None else held.loop
     usual = (None, None) if loop is None else (loop.rate_hz, loop.measurement_delay_s)
     setting = LoopSetting(*loop_of(model, rate_hz, delay_s, usual))
+    if model.suffix.lower() == ".toml":
+        setting = with_direct_share(setting, read_tables(model))
     gains: PidGains | LinearController
     if any(value is not None for value in given):
         if kp is None or ki is None or kind is not None:
@@ -88,12 +92,7 @@ def command(
     else:
         raise click.UsageError("Missing options '--kp' and '--ki': the file has no [controller].")
     plant = read_any_plant(model)
-    found = margins(
-        plant,
-        gains,
-        loop_delay_s=setting.measurement_delay_s,
-        rate_hz=setting.rate_hz,
-    )
+    found = loop_margins(plant, gains, setting)
     answer = margins_answer(found, setting)
     emit(answer, as_json=as_json, out=out)
     save_plot(plot, lambda: loop_chart(plant, gains, setting, found.crossover_rad_s))

@@ -10,6 +10,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 from scipy.linalg import expm
 
+from haselab.base import InputError
 from haselab.control.gains import PidGains
 from haselab.control.linear import LinearController
 from haselab.control.plants.modes import Modes
@@ -23,6 +24,8 @@ __all__ = [
     "corners_of",
     "frequency_variants",
     "sampled_response_of",
+    "static_gain",
+    "updates_late",
 ]
 
 Floats = NDArray[np.float64]
@@ -54,19 +57,32 @@ class HeldModel:
     samples: int
 
     @classmethod
-    def of(cls, model: RationalModel, *, period_s: float, measurement_delay_s: float) -> HeldModel:
-        """Discretise a model.
+    def of(
+        cls,
+        model: RationalModel,
+        *,
+        period_s: float,
+        measurement_delay_s: float,
+        direct_share: float = 0.0,
+    ) -> HeldModel:
+        """Discretise a model, to the output that a loop measures; see `LoopSetting.direct_share`.
 
+        Raises:
+            InputError: a direct share, but the model integrates.
         Source: variation of constants in controllable form, with time scaled by the poles'
             magnitude.
         """
         a, b, c, d, omega = _scaled_states(model)
         delay_s = model.delay_s + measurement_delay_s
-        samples = math.floor(delay_s / period_s + _WHOLE) + 1
+        samples = updates_late(delay_s, period_s)
         lead_s = min(samples * period_s - delay_s, period_s)
         step, push = _held(a, b, omega * period_s)
         lead, lead_push = _held(a, b, omega * lead_s)
-        return cls(step, push, c @ lead, float(c @ lead_push) + d, samples)
+        kept = 1.0 - direct_share
+        feed = kept * (float(c @ lead_push) + d)
+        if direct_share:
+            feed += direct_share * static_gain(model)
+        return cls(step, push, kept * (c @ lead), feed, samples)
 
     def response(self, omega_rad_s: ArrayLike, period_s: float) -> Complexes:
         """Response from held input to sampled output, in (0, pi / period_s]. Shape `(...)`."""
@@ -78,6 +94,26 @@ class HeldModel:
         right = np.broadcast_to(self.push[:, None], (*z.shape, size, 1))
         states = np.linalg.solve(shifted, right)[..., 0]
         return np.asarray(z**-self.samples * (states @ self.read + self.feed))
+
+
+def static_gain(plant: AnyPlant) -> float:
+    """Static gain, for a share of the measurement that follows the drive at once.
+
+    Args:
+        plant: plant.
+    Returns:
+        The gain.
+    Raises:
+        InputError: the plant integrates.
+    """
+    if isinstance(plant, Plant):
+        return plant.static_gain
+    if plant.denominator[-1] == 0.0:
+        raise InputError(
+            "A share of the measurement follows the drive at once (direct_share), but the model "
+            "integrates, so its static gain is infinite. Remove direct_share."
+        )
+    return plant.numerator[-1] / plant.denominator[-1]
 
 
 def _scaled_states(model: RationalModel) -> tuple[Floats, Floats, Floats, float, float]:
@@ -172,23 +208,50 @@ def frequency_variants(plant: AnyPlant, spread: float) -> tuple[AnyPlant, ...]:
 
 
 def sampled_response_of(
-    plant: AnyPlant, omega_rad_s: ArrayLike, rate_hz: float, delay_s: float
+    plant: AnyPlant,
+    omega_rad_s: ArrayLike,
+    rate_hz: float,
+    delay_s: float,
+    direct_share: float = 0.0,
 ) -> Complexes:
     """Sampled frequency response with hold, delayed by `delay_s` plus the plant's own delay.
 
-    It is not finite at an undamped pole.
+    It is that of the output that a loop measures, see `LoopSetting.direct_share`. It is not finite
+    at an undamped pole.
     """
     if isinstance(plant, Plant):
         modes = Modes.of(plant)
         with np.errstate(divide="ignore", invalid="ignore"):
-            return modes.sampled_response(omega_rad_s, rate_hz, delay_s + plant.delay_s)
-    return _held_model(plant, 1.0 / rate_hz, delay_s).response(omega_rad_s, 1.0 / rate_hz)
+            moved = modes.sampled_response(omega_rad_s, rate_hz, delay_s + plant.delay_s)
+        if direct_share == 0.0:
+            return moved
+        late = updates_late(plant.delay_s + delay_s, 1.0 / rate_hz)
+        turned = np.exp(-1j * np.asarray(omega_rad_s, dtype=float) * (late / rate_hz))
+        return np.asarray((1.0 - direct_share) * moved + direct_share * plant.static_gain * turned)
+    held = _held_model(plant, 1.0 / rate_hz, delay_s, direct_share)
+    return held.response(omega_rad_s, 1.0 / rate_hz)
+
+
+def updates_late(delay_s: float, period_s: float) -> int:
+    """Updates from an output until a measurement that contains it.
+
+    Args:
+        delay_s: of plant and measurement, in s.
+        period_s: of the loop, in s.
+    Returns:
+        Number of updates, 1 or more.
+    """
+    return math.floor(delay_s / period_s + _WHOLE) + 1
 
 
 @lru_cache(maxsize=64)
-def _held_model(model: RationalModel, period_s: float, delay_s: float) -> HeldModel:
+def _held_model(
+    model: RationalModel, period_s: float, delay_s: float, direct_share: float
+) -> HeldModel:
     """The samples of a model; the response of one loop is evaluated dozens of times."""
-    return HeldModel.of(model, period_s=period_s, measurement_delay_s=delay_s)
+    return HeldModel.of(
+        model, period_s=period_s, measurement_delay_s=delay_s, direct_share=direct_share
+    )
 
 
 def corners_of(plant: AnyPlant, gains: PidGains | LinearController | None = None) -> Complexes:

@@ -15,7 +15,7 @@ __all__ = [
 ]
 
 
-def margins_answer(found: Margins, setting: LoopSetting) -> dict[str, float | bool]:
+def margins_answer(found: Margins, setting: LoopSetting) -> JsonObject:
     """Collect the margins for an answer.
 
     Args:
@@ -33,7 +33,16 @@ def margins_answer(found: Margins, setting: LoopSetting) -> dict[str, float | bo
         "crossover_rad_s": found.crossover_rad_s,
         "rate_hz": setting.rate_hz,
         "delay_s": setting.measurement_delay_s,
+        **_direct_share(setting),
     }
+
+
+def _direct_share(setting: LoopSetting) -> JsonObject:
+    """Direct share of the measurement and its range, where the loop has one."""
+    if setting.direct_share == 0.0:
+        return {}
+    share = setting.direct_share
+    return {"direct_share": share, "direct_range": list(setting.direct_range or (share, share))}
 
 
 def _shares(found: PlausibleMargins) -> dict[str, Estimate]:
@@ -108,6 +117,7 @@ def design_answer(design: Design) -> JsonObject:
         "limits": [design.setting.saturation.low, design.setting.saturation.high],
         "rate_hz": design.setting.rate_hz,
         "delay_s": design.setting.measurement_delay_s,
+        **_direct_share(design.setting),
         "shortfalls": list(design.shortfalls),
         **more,
     }

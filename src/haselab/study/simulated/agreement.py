@@ -9,19 +9,20 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
-from haselab.actuators import equilibrium_m, linearise
+from haselab.actuators import OperatingPoint, direct_share, equilibrium_m, linearise
 from haselab.base import LimitError, ResultError
 from haselab.control import (
     DesignSpec,
     LoopSetting,
     PidGains,
     Saturation,
-    margins,
     simulate_loop,
 )
-from haselab.control.plants.general import AnyPlant, frequency_variants
+from haselab.control.direct_share import with_direct_share
+from haselab.control.plants.general_loops import loop_variants
+from haselab.control.stability.margins import loop_margins
 from haselab.firmware import CAPACITANCE_NOISE
-from haselab.models.actuator.strain_map import StrainMap
+from haselab.models.actuator.strain_map import HIGHEST_SHARE, StrainMap
 from haselab.models.rational import RationalModel
 from haselab.rig.chip import ChipDesign
 from haselab.rig.twin.config import TwinConfig
@@ -121,8 +122,17 @@ class StepCase:
     def is_robust(self) -> bool:
         """Whether the loop is stable with each natural frequency that the design covers."""
         return all(
-            _stable(self, plant) for plant in frequency_variants(self.design.plant, self.spread)
+            loop_margins(plant, self.gains, loop).stable
+            for plant, loop in loop_variants(self.design.plant, self.loop, self.spread)
         )
+
+    @property
+    def loop(self) -> LoopSetting:
+        """The chip's loop, with the direct share of the actuator file."""
+        settings = self.design.settings
+        limits = Saturation(settings.strain_low, settings.strain_high)
+        setting = LoopSetting(FAST.rate_hz, CHIP_DELAY_S, limits)
+        return with_direct_share(setting, self.design.tables)
 
     def differences(self, one: LoopRun, other: LoopRun) -> NDArray[np.float64]:
         """Difference of two responses at each time, as a fraction of the step.
@@ -186,6 +196,7 @@ def predicted_loop(
     white = None
     if noise:
         white = np.random.default_rng(case.seed).normal(0.0, case.noise_std, run.time_s.size)
+    setting = replace(setting, direct_share=case.loop.direct_share)
     trace = simulate_loop(plant, case.gains, run.reference, setting, measurement_noise=white)
     return replace(run, strain=trace.y)
 
@@ -247,22 +258,19 @@ def check_stable(case: StepCase) -> None:
     Raises:
         ResultError: The loop is unstable.
     """
-    if not _stable(case, case.design.plant):
+    if not loop_margins(case.design.plant, case.gains, case.loop).stable:
         raise ResultError(
             f"The loop of [model] and [controller] is unstable at the chip's {FAST.rate_hz:g} Hz "
             f"with a delay of {1e3 * CHIP_DELAY_S:.3g} ms. Design it again with --rate-hz and "
             f"--delay-s: {case.design.path}"
         )
-    if not _stable(case, _linear(case, case.plan.before)):
+    share = _direct_share(case, case.plan.before)
+    on_twin = replace(case.loop, direct_share=share, direct_range=None)
+    if not loop_margins(_linear(case, case.plan.before), case.gains, on_twin).stable:
         raise ResultError(
             f"The loop is unstable on this twin: {_two_plants(case)}. Choose the twin of this "
             f"actuator with --twin or --reading: {case.design.path}"
         )
-
-
-def _stable(case: StepCase, plant: AnyPlant) -> bool:
-    """Whether the loop with a plant is stable at the chip's rate and delay."""
-    return margins(plant, case.gains, loop_delay_s=CHIP_DELAY_S, rate_hz=FAST.rate_hz).stable
 
 
 def _unstable_within_spread(case: StepCase) -> str:
@@ -321,21 +329,34 @@ def _causes(desktop: LoopRun, chip: LoopRun, case: StepCase) -> Iterator[str]:
 
 def _linear(case: StepCase, strain: float) -> RationalModel:
     """The softened twin from corrected strain to strain, where the model reaches a strain."""
+    volt, high_v = case.design.tables.voltage_map(), _gain_v(case)
+    point, corrected = _point(case, strain)
+    gain = point.gain_m_per_v * high_v * float(volt.slope_v(corrected)) / case.plan.zero_length_m
+    bottom, top = np.real(np.poly(point.poles)), np.real(np.poly(point.zeros))
+    return RationalModel(tuple(gain * bottom[-1] / top[-1] * top), tuple(bottom))
+
+
+def _point(case: StepCase, strain: float) -> tuple[OperatingPoint, float]:
+    """The softened twin where the model reaches a strain, and the corrected strain there."""
     settings, volt = case.design.settings, case.design.tables.voltage_map()
     corrected = strain / case.design.plant.static_gain
     corrected = min(max(corrected, settings.strain_low), settings.strain_high)
     law, load = case.config.law, case.config.load
-    high_v = _gain_v(case)
     point = linearise(
         law,
-        high_v * max(float(volt.voltage_v(corrected)), 0.0),
+        _gain_v(case) * max(float(volt.voltage_v(corrected)), 0.0),
         load.mass_kg * GRAVITY_M_S2,
         load.mass_kg + load.added_inertia_kg,
         longest_m=law.length_limits_m.high,
     )
-    gain = point.gain_m_per_v * high_v * float(volt.slope_v(corrected)) / case.plan.zero_length_m
-    bottom, top = np.real(np.poly(point.poles)), np.real(np.poly(point.zeros))
-    return RationalModel(tuple(gain * bottom[-1] / top[-1] * top), tuple(bottom))
+    return point, corrected
+
+
+def _direct_share(case: StepCase, strain: float) -> float:
+    """Direct share of the softened twin where the model reaches a strain."""
+    point, _ = _point(case, strain)
+    share = direct_share(case.config.law, point.length_m, point.voltage_v, point.gain_m_per_v)
+    return float(np.clip(share, -HIGHEST_SHARE, HIGHEST_SHARE))
 
 
 def _gain_v(case: StepCase) -> float:

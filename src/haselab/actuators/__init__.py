@@ -7,8 +7,8 @@ from haselab.actuators.losses import DRIFT_LIMITS, DRIFT_TIMES, DRIFT_UNITS, DRI
 from haselab.actuators.motion import ActuatorState, rates
 from haselab.actuators.operating_point import (
     OperatingPoint,
-    direct_share,
     equilibrium_m,
+    feedthrough,
     linearise,
 )
 from haselab.actuators.peano_hasel import PeanoHasel
@@ -56,9 +56,9 @@ __all__ = [
     "SampledLaw",
     "Scales",
     "actuator_law",
-    "direct_share",
     "draw_parameters",
     "equilibrium_m",
+    "feedthrough",
     "law_table",
     "linearise",
     "measured_parameters",

@@ -12,7 +12,7 @@ from haselab.actuators.law import ActuatorLaw
 from haselab.base import LimitError
 from haselab.base.root import root
 
-__all__ = ["OperatingPoint", "direct_share", "equilibrium_m", "linearise"]
+__all__ = ["OperatingPoint", "equilibrium_m", "feedthrough", "linearise"]
 
 Floats = NDArray[np.float64]
 Complexes = NDArray[np.complex128]
@@ -140,8 +140,8 @@ def equilibrium_m(
     return length
 
 
-def direct_share(law: ActuatorLaw, length_m: float, voltage_v: float, gain_m_per_v: float) -> float:
-    """Share of a lasting change of the sensed capacitance that follows the voltage at once.
+def feedthrough(law: ActuatorLaw, length_m: float, voltage_v: float, gain_m_per_v: float) -> float:
+    """Fraction of a steady-state change of the capacitance that a held length does not prevent.
 
     Args:
         law: of the actuator.
@@ -155,7 +155,7 @@ def direct_share(law: ActuatorLaw, length_m: float, voltage_v: float, gain_m_per
         >>> from haselab.actuators import PeanoHasel, PlanarHasel
         >>> for law, load_n in ((PlanarHasel(), 2.45), (PeanoHasel(), 1.0)):
         ...     point = linearise(law, 5000.0, load_n, load_n / 9.81)
-        ...     print(round(direct_share(law, point.length_m, 5000.0, point.gain_m_per_v), 3))
+        ...     print(round(feedthrough(law, point.length_m, 5000.0, point.gain_m_per_v), 3))
         0.0
         0.25
     """

@@ -71,7 +71,7 @@ class Task:
     def variants(self) -> tuple[tuple[AnyPlant, LoopSetting], ...]:
         """The nominal plant and loop, and others that the controller has to work with.
 
-        The natural frequency is varied to both sides, and the direct share to its ends.
+        The natural frequency is varied to both sides, and the feedthrough to its ends.
         """
         return loop_variants(self.plant, self.setting, self.spec.frequency_spread)
 
@@ -199,7 +199,7 @@ def _traces(
 ) -> tuple[NDArray[np.float64], list[NDArray[np.complex128]]]:
     """Outputs and poles of every candidate on the first plant, then on the second, ...
 
-    An output is that of the plant, as late as its measurement.
+    An output is that of the plant, with the delay of the measurement.
     """
     outputs, poles = [], []
     for plant, setting in variants:
@@ -212,7 +212,7 @@ def _traces(
                 candidates,
                 period_s=1.0 / setting.rate_hz,
                 measurement_delay_s=setting.measurement_delay_s,
-                direct_share=setting.direct_share,
+                feedthrough=setting.feedthrough,
             )
             poles += list(loops.poles())
         else:

@@ -38,7 +38,7 @@ def loop_chart(
     omega = np.geomspace(middle / 100.0, min(100.0 * middle, highest), _POINTS)
     response = loop_response(
         plant, gains, omega, loop_delay_s=setting.measurement_delay_s, rate_hz=setting.rate_hz,
-        direct_share=setting.direct_share,
+        feedthrough=setting.feedthrough,
     )  # fmt: skip
     hz, one = omega / (2.0 * np.pi), np.ones(_POINTS)
     axis = "Frequency (Hz)"
@@ -74,8 +74,10 @@ def step_chart(
     loop = loop_chart(plant, gains, setting, crossover_rad_s)
     controller, output = names or ("Controller", "Output")
     curves = [Curve(found.time_s, found.measured, "measured by the loop")]
-    if setting.direct_share:
-        curves.append(Curve(found.time_s, found.output, "output, as late"))
+    if setting.feedthrough:
+        curves.append(
+            Curve(found.time_s, found.output, "output, with the delay of the measurement")
+        )
     curves.append(Curve(found.time_s, found.reference, "reference"))
     return Chart("Predicted step, and the open loop with its delay", (
         Panel("Time (s)", output, tuple(curves)),

@@ -82,7 +82,7 @@ class Design:
         spec: the specification.
         setting: rate, measurement delay and saturation that it was designed for.
         nominal: prediction for the given plant.
-        spread: predictions over the spread of natural frequency and direct share, the nominal one
+        spread: predictions over the spread of natural frequency and feedthrough, the nominal one
             first.
         shortfalls: unmet demands, as text; empty if all are met.
         plant: that it was designed for.
@@ -261,7 +261,7 @@ def _slowest_s(plant: AnyPlant, gains: PidGains, setting: LoopSetting) -> float:
             [gains],
             period_s=period_s,
             measurement_delay_s=delay_s,
-            direct_share=setting.direct_share,
+            feedthrough=setting.feedthrough,
         )
         poles = loops.poles()[0]
     else:
@@ -390,7 +390,7 @@ def _with_peaks(found: Design, task: Task, rng: np.random.Generator, space: _Spa
 
     An output that its loop does not see may ring faster than the loop is.
     """
-    if not task.setting.direct_share or task.spec.overshoot is None:
+    if not task.setting.feedthrough or task.spec.overshoot is None:
         return found
     for _ in range(_AGAIN):
         worst = max(item.step.overshoot for item in found.spread)

@@ -26,8 +26,8 @@ class PredictedStep:
         time_s: since the step, in s. Shape `(N,)`.
         reference: the step.
         measured: what the loop measures, with its delay.
-        output: of the plant, as late as its measurement. It differs from `measured` if a share of
-            the measurement follows the drive at once.
+        output: of the plant, with the delay of the measurement. It differs from `measured` in a
+            loop with feedthrough.
         u: output of the controller.
     """
 

@@ -24,8 +24,8 @@ from haselab.actuators import (
     GRAVITY_M_S2,
     ActuatorLaw,
     LawTable,
-    direct_share,
     equilibrium_m,
+    feedthrough,
     law_table,
     measured_parameters,
     with_parameters,
@@ -316,14 +316,14 @@ class KnownActuator:
         """Whether the capacitance at one length depends on the voltage, as that of pouches."""
         return len(self.table.pull_n_v2) > 1
 
-    def direct_share(self, strain: float) -> float:
-        """Share of a lasting change of the sensed strain that follows the drive at once.
+    def feedthrough(self, strain: float) -> float:
+        """Feedthrough of the drive to the sensed strain, see `LoopSetting`.
 
         Args:
             strain: that is held, within the reachable ones.
         Returns:
             What the change of the voltage at constant length contributes to the change of the
-            capacitance, as a share of it; 0 for a capacitance that depends on the length alone.
+            capacitance, as a fraction of it; 0 for a capacitance that depends on the length alone.
         Raises:
             InputError: See `reachable`.
         """
@@ -336,7 +336,7 @@ class KnownActuator:
         volts = [
             self.gain_v_per_v * self.static_drive_v(middle + side * step) for side in (-1.0, 1.0)
         ]
-        return direct_share(
+        return feedthrough(
             self.law,
             0.5 * sum(lengths),
             0.5 * sum(volts),

@@ -218,7 +218,7 @@ def _follows_drive(loop: LoopSettings) -> bool:
     """Whether the sensed strain follows the drive at once, as far as it is known."""
     if loop.actuator is not None:
         return loop.actuator.capacitance_follows_drive
-    return loop.strain_map.direct_share > 0.0
+    return loop.strain_map.feedthrough > 0.0
 
 
 def _watchdog(rig: GuardedRig, carrier: tuple[float, float], loop: LoopSettings) -> LoopWatchdog:

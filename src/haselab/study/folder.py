@@ -250,11 +250,11 @@ def write_design(
 
 
 def _strain_map(maps: Maps, dynamics: Dynamics | None) -> StrainMap:
-    """The map from capacitance to strain, with the direct share that the chirp determines."""
-    share = None if dynamics is None else dynamics.clear_share
-    if share is None:
+    """The map from capacitance to strain, with the feedthrough that the chirp determines."""
+    found = None if dynamics is None else dynamics.significant_feedthrough
+    if found is None:
         return maps.strain_map
-    return replace(maps.strain_map, direct_share=share.value, direct_share_std=share.std)
+    return replace(maps.strain_map, feedthrough=found.value, feedthrough_std=found.std)
 
 
 def sections_found(found: Findings) -> list[str]:

@@ -25,7 +25,7 @@ from haselab.control import (
     design_controller,
 )
 from haselab.control.charts import loop_chart
-from haselab.control.direct_share import with_direct_share
+from haselab.control.feedthrough import feedthrough_doubt, with_feedthrough
 from haselab.control.gains import gain_units
 from haselab.control.plants.general import AnyPlant
 from haselab.control.plausible_design import USUAL_STRUCTURE
@@ -119,7 +119,8 @@ def command(
 
     MODEL is a model.json or an actuator file. The command reads [model], [drive] and the demands of
     an actuator file and writes its [controller], but leaves the file unchanged if --out is given.
-    The margins include the delay of the loop. If the model has a covariance, plausible plants are
+    The margins include the delay of the loop and the feedthrough of the sensed strain. If the model
+    has a covariance, plausible plants are
     drawn from it, and the share of them that keeps the margins is reported.
     """
     warn_misspelled_in(model)
@@ -313,11 +314,15 @@ def _judge(
 
 
 def _setting(model: Path, rate_hz: float, delay_s: float, limits: Saturation) -> LoopSetting:
-    """The loop of a model; that of an actuator file with its direct share."""
+    """The loop of a model; that of an actuator file with its feedthrough."""
     setting = LoopSetting(rate_hz, delay_s, limits)
     if model.suffix.lower() != ".toml":
         return setting
-    return with_direct_share(setting, read_tables(model))
+    tables = read_tables(model)
+    found = with_feedthrough(setting, tables)
+    if doubt := feedthrough_doubt(found, tables):
+        click.echo(f"haselab: warning: {doubt}: {model}", err=True)
+    return found
 
 
 def _save(model: Path, out: Path | None, section: dict[str, object], spec: Path | None) -> None:

@@ -383,7 +383,7 @@ def _metrics(
     try:
         if case is None:
             return loop_row(loop, None, plant)
-        return loop_row(loop, case.gains, plant, case.loop.direct_share)
+        return loop_row(loop, case.gains, plant, case.loop.feedthrough)
     except InputError:
         raise InputError(
             f"After the step from {plan.before:g} to {plan.after:g}, the strain ({name}) does not "

@@ -22,10 +22,10 @@ __all__ = [
     "HeldModel",
     "PlantScale",
     "corners_of",
+    "delay_in_updates",
     "frequency_variants",
     "sampled_response_of",
     "static_gain",
-    "updates_late",
 ]
 
 Floats = NDArray[np.float64]
@@ -63,25 +63,25 @@ class HeldModel:
         *,
         period_s: float,
         measurement_delay_s: float,
-        direct_share: float = 0.0,
+        feedthrough: float = 0.0,
     ) -> HeldModel:
-        """Discretise a model, to the output that a loop measures; see `LoopSetting.direct_share`.
+        """Discretise a model, to the output that a loop measures; see `LoopSetting.feedthrough`.
 
         Raises:
-            InputError: a direct share, but the model integrates.
+            InputError: a feedthrough, but the model integrates.
         Source: variation of constants in controllable form, with time scaled by the poles'
             magnitude.
         """
         a, b, c, d, omega = _scaled_states(model)
         delay_s = model.delay_s + measurement_delay_s
-        samples = updates_late(delay_s, period_s)
+        samples = delay_in_updates(delay_s, period_s)
         lead_s = min(samples * period_s - delay_s, period_s)
         step, push = _held(a, b, omega * period_s)
         lead, lead_push = _held(a, b, omega * lead_s)
-        kept = 1.0 - direct_share
+        kept = 1.0 - feedthrough
         feed = kept * (float(c @ lead_push) + d)
-        if direct_share:
-            feed += direct_share * static_gain(model)
+        if feedthrough:
+            feed += feedthrough * static_gain(model)
         return cls(step, push, kept * (c @ lead), feed, samples)
 
     def response(self, omega_rad_s: ArrayLike, period_s: float) -> Complexes:
@@ -97,7 +97,7 @@ class HeldModel:
 
 
 def static_gain(plant: AnyPlant) -> float:
-    """Static gain, for a share of the measurement that follows the drive at once.
+    """Static gain, for the feedthrough of a measurement.
 
     Args:
         plant: plant.
@@ -110,8 +110,8 @@ def static_gain(plant: AnyPlant) -> float:
         return plant.static_gain
     if plant.denominator[-1] == 0.0:
         raise InputError(
-            "A share of the measurement follows the drive at once (direct_share), but the model "
-            "integrates, so its static gain is infinite. Remove direct_share."
+            "The feedthrough of the sensed strain needs a finite static gain, but the model "
+            "integrates. Set feedthrough = 0 in [sensing.strain_map]."
         )
     return plant.numerator[-1] / plant.denominator[-1]
 
@@ -212,27 +212,27 @@ def sampled_response_of(
     omega_rad_s: ArrayLike,
     rate_hz: float,
     delay_s: float,
-    direct_share: float = 0.0,
+    feedthrough: float = 0.0,
 ) -> Complexes:
     """Sampled frequency response with hold, delayed by `delay_s` plus the plant's own delay.
 
-    It is that of the output that a loop measures, see `LoopSetting.direct_share`. It is not finite
+    It is that of the output that a loop measures, see `LoopSetting.feedthrough`. It is not finite
     at an undamped pole.
     """
     if isinstance(plant, Plant):
         modes = Modes.of(plant)
         with np.errstate(divide="ignore", invalid="ignore"):
             moved = modes.sampled_response(omega_rad_s, rate_hz, delay_s + plant.delay_s)
-        if direct_share == 0.0:
+        if feedthrough == 0.0:
             return moved
-        late = updates_late(plant.delay_s + delay_s, 1.0 / rate_hz)
+        late = delay_in_updates(plant.delay_s + delay_s, 1.0 / rate_hz)
         turned = np.exp(-1j * np.asarray(omega_rad_s, dtype=float) * (late / rate_hz))
-        return np.asarray((1.0 - direct_share) * moved + direct_share * plant.static_gain * turned)
-    held = _held_model(plant, 1.0 / rate_hz, delay_s, direct_share)
+        return np.asarray((1.0 - feedthrough) * moved + feedthrough * plant.static_gain * turned)
+    held = _held_model(plant, 1.0 / rate_hz, delay_s, feedthrough)
     return held.response(omega_rad_s, 1.0 / rate_hz)
 
 
-def updates_late(delay_s: float, period_s: float) -> int:
+def delay_in_updates(delay_s: float, period_s: float) -> int:
     """Updates from an output until a measurement that contains it.
 
     Args:
@@ -246,11 +246,11 @@ def updates_late(delay_s: float, period_s: float) -> int:
 
 @lru_cache(maxsize=64)
 def _held_model(
-    model: RationalModel, period_s: float, delay_s: float, direct_share: float
+    model: RationalModel, period_s: float, delay_s: float, feedthrough: float
 ) -> HeldModel:
     """The samples of a model; the response of one loop is evaluated dozens of times."""
     return HeldModel.of(
-        model, period_s=period_s, measurement_delay_s=delay_s, direct_share=direct_share
+        model, period_s=period_s, measurement_delay_s=delay_s, feedthrough=feedthrough
     )
 
 

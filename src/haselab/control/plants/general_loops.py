@@ -12,9 +12,9 @@ from haselab.control.gains import PidGains
 from haselab.control.plants.general import (
     AnyPlant,
     HeldModel,
+    delay_in_updates,
     frequency_variants,
     static_gain,
-    updates_late,
 )
 from haselab.control.simulate import LoopSetting
 from haselab.models.rational import RationalModel
@@ -40,17 +40,17 @@ def loop_variants(
         setting: its loop.
         spread: change of the frequencies to either side, relative to them.
     Returns:
-        The nominal plant and loop, then other frequencies, then the ends of the direct share.
+        The nominal plant and loop, then other frequencies, then the ends of the feedthrough.
     """
-    ends = {end for end in setting.direct_range or () if end != setting.direct_share}
+    ends = {end for end in setting.feedthrough_range or () if end != setting.feedthrough}
     return (
         *((one, setting) for one in frequency_variants(plant, spread)),
-        *((plant, replace(setting, direct_share=end)) for end in sorted(ends)),
+        *((plant, replace(setting, feedthrough=end)) for end in sorted(ends)),
     )
 
 
 def plant_output(plant: AnyPlant, measured: Floats, u: Floats, setting: LoopSetting) -> Floats:
-    """The plant's output, as late as the measurement, from what a simulated loop measured.
+    """The plant's output, with the delay of the measurement, from what a simulated loop measured.
 
     Args:
         plant: plant.
@@ -58,15 +58,16 @@ def plant_output(plant: AnyPlant, measured: Floats, u: Floats, setting: LoopSett
         u: outputs of its controller. Shape `(..., N)`.
         setting: of the loop.
     Returns:
-        The measurements without the share that follows the drive at once. Shape `(..., N)`.
+        The measurements without the feedthrough. Shape `(..., N)`.
     """
-    share = setting.direct_share
-    if share == 0.0:
+    if setting.feedthrough == 0.0:
         return measured
-    late = updates_late(plant.delay_s + setting.measurement_delay_s, 1.0 / setting.rate_hz)
+    late = delay_in_updates(plant.delay_s + setting.measurement_delay_s, 1.0 / setting.rate_hz)
     direct = np.zeros_like(measured)
-    direct[..., late:] = share * static_gain(plant) * u[..., : measured.shape[-1] - late]
-    return np.asarray((measured - direct) / (1.0 - share))
+    direct[..., late:] = (
+        setting.feedthrough * static_gain(plant) * u[..., : measured.shape[-1] - late]
+    )
+    return np.asarray((measured - direct) / (1.0 - setting.feedthrough))
 
 
 def _held(model: RationalModel, setting: LoopSetting) -> HeldModel:
@@ -74,7 +75,7 @@ def _held(model: RationalModel, setting: LoopSetting) -> HeldModel:
         model,
         period_s=1.0 / setting.rate_hz,
         measurement_delay_s=setting.measurement_delay_s,
-        direct_share=setting.direct_share,
+        feedthrough=setting.feedthrough,
     )
 
 

@@ -135,7 +135,7 @@ class LoopTable:
             plants,
             period_s=period_s,
             measurement_delay_s=setting.measurement_delay_s,
-            direct_share=setting.direct_share,
+            feedthrough=setting.feedthrough,
         )
         if held.samples.max() >= _LONGEST_DELAY:
             raise InputError(

@@ -102,7 +102,7 @@ class SampledLoops:
         *,
         period_s: float,
         measurement_delay_s: float,
-        direct_share: float = 0.0,
+        feedthrough: float = 0.0,
     ) -> SampledLoops:
         """Compute the coefficients from one plant and one controller per loop."""
         kp, ki, kd, tau = np.array([(g.kp, g.ki, g.kd, g.derivative_filter_s) for g in gains]).T
@@ -111,7 +111,7 @@ class SampledLoops:
                 plants,
                 period_s=period_s,
                 measurement_delay_s=measurement_delay_s,
-                direct_share=direct_share,
+                feedthrough=feedthrough,
             ),
             kp=kp,
             ki=ki * period_s,

@@ -80,7 +80,7 @@ def loop_response(
     *,
     loop_delay_s: float,
     rate_hz: float | None,
-    direct_share: float = 0.0,
+    feedthrough: float = 0.0,
 ) -> NDArray[np.complex128]:
     """Open-loop response: controller, plant, delay and, for a sampled loop, the hold.
 
@@ -90,11 +90,11 @@ def loop_response(
         omega_rad_s: angular frequencies, in rad/s. Shape `(...)`.
         loop_delay_s: delay besides the plant's and the hold's, in s.
         rate_hz: sampling rate of the loop, in Hz; None for a continuous loop.
-        direct_share: of the measurement, see `LoopSetting`.
+        feedthrough: of the measurement, see `LoopSetting`.
     Returns:
         Complex response of the same shape.
     Raises:
-        LimitError: `rate_hz` is None, and the controller or the direct share exists only sampled.
+        LimitError: `rate_hz` is None, and the controller or the feedthrough exists only sampled.
     Example:
         >>> from haselab.models import Plant
         >>> plant, gains = Plant(1.0, 20.0, 0.5), PidGains(0.0, 2.0)
@@ -106,11 +106,13 @@ def loop_response(
     if rate_hz is None:
         if isinstance(gains, LinearController):
             raise LimitError("rate_hz is None, but this controller is sampled. Give its rate_hz.")
-        if direct_share:
-            raise LimitError("rate_hz is None, but a direct share needs a sampled loop. Give one.")
+        if feedthrough:
+            raise LimitError(
+                "rate_hz is None, but a feedthrough needs a sampled loop. Give its rate_hz."
+            )
         delay = np.exp(-1j * omega * loop_delay_s)
         return np.asarray(gains.frequency_response(omega) * plant.frequency_response(omega) * delay)
-    sampled = sampled_response_of(plant, omega, rate_hz, loop_delay_s, direct_share)
+    sampled = sampled_response_of(plant, omega, rate_hz, loop_delay_s, feedthrough)
     return np.asarray(gains.sampled_response(omega, rate_hz) * sampled)
 
 
@@ -173,7 +175,7 @@ def margins(
     *,
     loop_delay_s: float,
     rate_hz: float | None,
-    direct_share: float = 0.0,
+    feedthrough: float = 0.0,
 ) -> Margins:
     """Compute the margins of a loop from its exact response, without approximating the delay.
 
@@ -188,7 +190,7 @@ def margins(
         loop_delay_s: delay besides the plant's and the hold's, in s.
         rate_hz: sampling rate, in Hz: plant behind a zero-order hold, controller sampled as in
             the C core; None for a continuous loop.
-        direct_share: of the measurement, see `LoopSetting`.
+        feedthrough: of the measurement, see `LoopSetting`.
     Returns:
         The margins.
     Raises:
@@ -213,7 +215,7 @@ def margins(
             omega,
             loop_delay_s=loop_delay_s,
             rate_hz=rate_hz,
-            direct_share=direct_share,
+            feedthrough=feedthrough,
         )
 
     omega = _with_delay(frequency_grid(plant, gains, rate_hz, 6000), plant.delay_s + loop_delay_s)
@@ -247,7 +249,7 @@ def margins(
 def loop_margins(
     plant: AnyPlant, gains: PidGains | LinearController, setting: LoopSetting
 ) -> Margins:
-    """Compute the margins of a loop at its rate, with its delay and direct share.
+    """Compute the margins of a loop at its rate, with its delay and feedthrough.
 
     Args:
         plant: see `margins`.
@@ -261,7 +263,7 @@ def loop_margins(
         gains,
         loop_delay_s=setting.measurement_delay_s,
         rate_hz=setting.rate_hz,
-        direct_share=setting.direct_share,
+        feedthrough=setting.feedthrough,
     )
 
 

@@ -22,7 +22,7 @@ from haselab.control import (
     design_controller,
     loop_response,
 )
-from haselab.control.direct_share import with_direct_share
+from haselab.control.feedthrough import with_feedthrough
 from haselab.control.plants.general import AnyPlant, PlantScale
 from haselab.control.plausible_design import evaluate_controller
 from haselab.control.predicted_step import predicted_step
@@ -142,9 +142,9 @@ def opened(files: PanelFiles) -> DesignedLoop:
     try:
         setting = replace(setting, saturation=limits_of(path, None))
     except HaselabError as error:
-        setting = with_direct_share(setting, tables)
+        setting = with_feedthrough(setting, tables)
         return DesignedLoop(path, sha256, plant, setting, held, str(error))
-    return DesignedLoop(path, sha256, plant, with_direct_share(setting, tables), held)
+    return DesignedLoop(path, sha256, plant, with_feedthrough(setting, tables), held)
 
 
 def gains_of(values: JsonObject) -> PidGains:
@@ -209,7 +209,7 @@ def _evaluate(files: PanelFiles, values: JsonObject) -> JsonObject:
     loop.require_pid()
     gains = gains_of(values)
     found = loop.margins(gains)
-    at_chip = replace(CHIP, direct_share=loop.setting.direct_share)
+    at_chip = replace(CHIP, feedthrough=loop.setting.feedthrough)
     chip = margins_answer(loop.margins(gains, at_chip), CHIP)
     step = None if loop.no_limits else _step(loop, gains, found.crossover_rad_s)
     return _response(loop, gains, found) | {"gains": asdict(gains), "chip": chip, "step": step}
@@ -226,7 +226,7 @@ def _response(loop: DesignedLoop, gains: PidGains | LinearController, found: Mar
     with np.errstate(divide="ignore", invalid="ignore"):  # a pole may be on the axis
         open_loop = loop_response(
             plant, gains, omega, loop_delay_s=setting.measurement_delay_s, rate_hz=setting.rate_hz,
-            direct_share=setting.direct_share,
+            feedthrough=setting.feedthrough,
         )  # fmt: skip
         alone = np.asarray(plant.frequency_response(omega))
     return {

@@ -33,16 +33,17 @@ def margins_answer(found: Margins, setting: LoopSetting) -> JsonObject:
         "crossover_rad_s": found.crossover_rad_s,
         "rate_hz": setting.rate_hz,
         "delay_s": setting.measurement_delay_s,
-        **_direct_share(setting),
+        **_feedthrough(setting),
     }
 
 
-def _direct_share(setting: LoopSetting) -> JsonObject:
-    """Direct share of the measurement and its range, where the loop has one."""
-    if setting.direct_share == 0.0:
+def _feedthrough(setting: LoopSetting) -> JsonObject:
+    """Feedthrough of the measurement and its range, where the loop has one."""
+    if setting.feedthrough == 0.0:
         return {}
-    share = setting.direct_share
-    return {"direct_share": share, "direct_range": list(setting.direct_range or (share, share))}
+    nominal = setting.feedthrough
+    range_ = setting.feedthrough_range or (nominal, nominal)
+    return {"feedthrough": nominal, "feedthrough_range": list(range_)}
 
 
 def _shares(found: PlausibleMargins) -> dict[str, Estimate]:
@@ -117,7 +118,7 @@ def design_answer(design: Design) -> JsonObject:
         "limits": [design.setting.saturation.low, design.setting.saturation.high],
         "rate_hz": design.setting.rate_hz,
         "delay_s": design.setting.measurement_delay_s,
-        **_direct_share(design.setting),
+        **_feedthrough(design.setting),
         "shortfalls": list(design.shortfalls),
         **more,
     }

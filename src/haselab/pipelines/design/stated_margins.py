@@ -10,7 +10,7 @@ from pathlib import Path
 
 from haselab.base import InputError
 from haselab.control import DesignSpec, LoopSetting, Saturation
-from haselab.control.direct_share import with_direct_share
+from haselab.control.feedthrough import with_feedthrough
 from haselab.control.plants.general_loops import loop_variants
 from haselab.control.stability.margins import loop_margins
 from haselab.models.actuator import ControllerSection
@@ -129,7 +129,7 @@ def _margins(held: ControllerSection, file: Path, loop: tuple[float, float]) -> 
     setting = LoopSetting(rate_hz, delay_s)
     if limits is not None:
         setting = replace(setting, saturation=Saturation(limits.low, limits.high))
-    setting = with_direct_share(setting, read_tables(file))
+    setting = with_feedthrough(setting, read_tables(file))
     found = loop_margins(plant, feedback, setting)
     known = {key: getattr(found, key) for key in _STATED if not key.startswith(_WORST)}
     known[_STABLE] = float(found.stable)

@@ -320,7 +320,7 @@ def chip_loop(program: Path, elf: Path, config: TwinConfig, seed: int, plan: Ste
 
 
 def loop_row(
-    loop: LoopRun, gains: PidGains | None, plant: Plant, direct_share: float = 0.0
+    loop: LoopRun, gains: PidGains | None, plant: Plant, feedthrough: float = 0.0
 ) -> JsonObject:
     """Metrics of a loop's step, and the margins of the fitted plant with its rate and delay.
 
@@ -328,13 +328,13 @@ def loop_row(
         loop: its response.
         gains: of its PID; None: it is not a PID, so no margins are computed.
         plant: as it was identified.
-        direct_share: of the measured strain, see `LoopSetting`.
+        feedthrough: of the measured strain, see `LoopSetting`.
     """
     found = step_metrics(loop.time_s, loop.strain, loop.reference).trials[0]
     robust = None
     if gains is not None:
         robust = margins(
-            plant, gains, loop_delay_s=loop.delay_s, rate_hz=loop.rate_hz, direct_share=direct_share
+            plant, gains, loop_delay_s=loop.delay_s, rate_hz=loop.rate_hz, feedthrough=feedthrough
         )
     return {
         "loop": loop.name,

@@ -154,12 +154,12 @@ class StepTest(Experiment[Steps]):
                 actuator=analysis.find(KnownActuator),
             )  # fmt: skip
             return {OWN: alone}
-        share = loops.setting.direct_share or math.nan
+        feedthrough = loops.setting.feedthrough or math.nan
         pi = LoopSettings(
             loops.pi.controller(),
             loops.setting.saturation,
             maps.voltage_map,
-            replace(maps.strain_map, direct_share=share),
+            replace(maps.strain_map, feedthrough=feedthrough),
             video_zero_px,
         )
         found = {

@@ -13,11 +13,11 @@ from haselab.base import Estimate, InputError, JsonObject, ResultError
 from haselab.identify.frequency.response import estimate_frequency_response
 from haselab.identify.record import Record
 from haselab.identify.transfer.fit import TransferFit, TransferStructure, fit_transfer
-from haselab.models.actuator.strain_map import HIGHEST_SHARE
+from haselab.models.actuator.strain_map import LARGEST_FEEDTHROUGH
 from haselab.models.plant import Plant, SlowMode
 from haselab.models.posterior import PlantPosterior
 from haselab.rig import RigDescription
-from haselab.sensing.direct_share import fit_direct_share
+from haselab.sensing.feedthrough import fit_feedthrough
 from haselab.study.definition import Study
 from haselab.study.fits.maps import Maps
 from haselab.study.fits.observe import Observation
@@ -26,7 +26,7 @@ __all__ = ["Dynamics", "fit_chirp", "fit_chirp_and_steps", "fit_chirp_of_voltage
 
 Floats = NDArray[np.float64]
 _UPDATE_HZ = 100.0  # one new output per block, row S5
-_LEAST_SHARE = 0.05
+_LEAST_FEEDTHROUGH = 0.05
 _BEFORE_STEP_S = 4.0  # of a step trial, to estimate its initial state
 
 
@@ -43,7 +43,7 @@ class Dynamics:
         residual_std: rms residual of the plant in the chirp, in strain.
         slow: fit of the slow branch to the steps.
         joined: fit of the fast mode to the chirp, with that branch.
-        direct_share: of the sensed strain in the chirp, see `fit_direct_share`; None: sensing
+        feedthrough: of the sensed strain in the chirp, see `fit_feedthrough`; None: sensing
             failed in it.
     """
 
@@ -55,15 +55,16 @@ class Dynamics:
     residual_std: float
     slow: TransferFit | None = None
     joined: TransferFit | None = None
-    direct_share: Estimate | None = None
+    feedthrough: Estimate | None = None
 
     @property
-    def clear_share(self) -> Estimate | None:
-        """The direct share if it is clearly more than errors of the maps could cause."""
-        found = self.direct_share
-        if found is None or not abs(found.value) <= HIGHEST_SHARE:
+    def significant_feedthrough(self) -> Estimate | None:
+        """The feedthrough if it is clearly more than errors of the maps could cause."""
+        found = self.feedthrough
+        if found is None or not abs(found.value) - 2.0 * found.std > _LEAST_FEEDTHROUGH:
             return None
-        return found if abs(found.value) - 2.0 * found.std > _LEAST_SHARE else None
+        limited = min(max(found.value, -LARGEST_FEEDTHROUGH), LARGEST_FEEDTHROUGH)
+        return Estimate.normal(limited, found.std, "")
 
 
 def _record(seen: Observation, maps: Maps, rig: RigDescription, from_s: float) -> Record:
@@ -133,7 +134,7 @@ def fit_chirp_and_steps(
     )
     (slow_gain, slow_tau) = slow.slow_modes[0]
     if not (np.isfinite(slow_gain.value) and np.isfinite(slow_tau.value)):
-        return _fast_alone(printed, sweep, study, _direct_share(chirp, maps, rig, printed))
+        return _fast_alone(printed, sweep, study, _feedthrough(chirp, maps, rig, printed))
     both = _checked(
         fit_transfer(
             [sweep],
@@ -154,7 +155,7 @@ def fit_chirp_and_steps(
     )  # fmt: skip
     posterior = _posterior(both, slow)
     figures: JsonObject = {}
-    share = _direct_share(chirp, maps, rig, both)
+    feedthrough = _feedthrough(chirp, maps, rig, both)
     if near is None:
         figures = {"chirp": _chirp_figure(sweep, printed, both, study.chirp.stop_hz)}
     else:
@@ -170,14 +171,14 @@ def fit_chirp_and_steps(
             "S20.slow_gain": slow_gain,
             "S20.slow_tau": slow_tau,
             **_second_order_results(printed),
-            **_share_result(share),
+            **_feedthrough_result(feedthrough),
         },
         figures=figures,
         posterior=posterior,
         residual_std=float(np.sqrt(np.mean(both.residuals[0] ** 2))),
         slow=slow,
         joined=both,
-        direct_share=share,
+        feedthrough=feedthrough,
     )
 
 
@@ -231,7 +232,7 @@ def fit_chirp_of_voltage(
 
 
 def _fast_alone(
-    printed: TransferFit, sweep: Record, study: Study, share: Estimate | None
+    printed: TransferFit, sweep: Record, study: Study, feedthrough: Estimate | None
 ) -> Dynamics:
     """The plant of a slow branch that the steps do not determine: without it."""
     e = printed.parameters
@@ -243,19 +244,19 @@ def _fast_alone(
         second_order=printed,
         quantities={
             "S20.gain": gain, "S20.omega_n": wn, "S20.zeta": zeta, "S20.delay": delay,
-            **_second_order_results(printed), **_share_result(share),
+            **_second_order_results(printed), **_feedthrough_result(feedthrough),
         },
         figures={"chirp": _chirp_figure(sweep, printed, None, study.chirp.stop_hz)},
         posterior=printed.posterior,
         residual_std=float(np.sqrt(np.mean(printed.residuals[0] ** 2))),
-        direct_share=share,
+        feedthrough=feedthrough,
     )  # fmt: skip
 
 
-def _direct_share(
+def _feedthrough(
     chirp: Observation, maps: Maps, rig: RigDescription, fit: TransferFit
 ) -> Estimate | None:
-    """Direct share of the sensed strain in the chirp; None if sensing failed in it.
+    """Feedthrough of the sensed strain in the chirp; None if sensing failed in it.
 
     Args:
         chirp: the chirp.
@@ -270,7 +271,7 @@ def _direct_share(
     _, after = _begin(chirp, rig, 0)
     strain = chirp.length_m[after] / maps.length_m - 1.0
     try:
-        return fit_direct_share(
+        return fit_feedthrough(
             chirp.sensed_s, sensed, fit.plant.static_gain * u, chirp.frame_time_s[after], strain,
             fit.modelled[0],
         )  # fmt: skip
@@ -278,8 +279,8 @@ def _direct_share(
         return None
 
 
-def _share_result(share: Estimate | None) -> dict[str, Estimate]:
-    return {} if share is None else {"S20.direct_share": share}
+def _feedthrough_result(found: Estimate | None) -> dict[str, Estimate]:
+    return {} if found is None else {"S20.feedthrough": found}
 
 
 def _second_order(sweep: Record, near: TransferFit | None = None) -> TransferFit:

@@ -17,7 +17,7 @@ from haselab.control import (
     Saturation,
     design_pid,
 )
-from haselab.control.direct_share import with_share
+from haselab.control.feedthrough import with_measured_feedthrough
 from haselab.control.plants.general import AnyPlant
 from haselab.control.reach import reachable_range
 from haselab.control.stability.margins import loop_margins
@@ -243,7 +243,8 @@ def design_loops(
     """
     output_s = None if output is None else output.value
     setting = given.setting if given else loop_setting(study, rig, to_volt, output_s)
-    setting = with_share(setting, found.clear_share)
+    if study.steps.feedback != "video":
+        setting = with_measured_feedthrough(setting, found.significant_feedthrough)
     held_back_s = study.steps.extra_delay_blocks * rig.block_s
     late = replace(setting, measurement_delay_s=setting.measurement_delay_s + held_back_s)
     scaled = printed_gains(study, found.plant)

@@ -243,8 +243,8 @@ def _dynamics() -> dict[str, Quantity]:
             paper_note="a first-order term in addition to eq. 8: the creep in a step",
         ),
         "S20.slow_tau": Quantity("plant, time constant of the slow branch", "s"),
-        "S20.direct_share": Quantity(
-            "share of the sensed strain that follows the voltage at once",
+        "S20.feedthrough": Quantity(
+            "feedthrough: fraction of the sensed strain that follows the voltage at once",
             "",
             paper_note="0 for a capacitance that depends on the length alone",
         ),

@@ -9,7 +9,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
-from haselab.actuators import OperatingPoint, direct_share, equilibrium_m, linearise
+from haselab.actuators import OperatingPoint, equilibrium_m, feedthrough, linearise
 from haselab.base import LimitError, ResultError
 from haselab.control import (
     DesignSpec,
@@ -18,11 +18,11 @@ from haselab.control import (
     Saturation,
     simulate_loop,
 )
-from haselab.control.direct_share import with_direct_share
+from haselab.control.feedthrough import with_feedthrough
 from haselab.control.plants.general_loops import loop_variants
 from haselab.control.stability.margins import loop_margins
 from haselab.firmware import CAPACITANCE_NOISE
-from haselab.models.actuator.strain_map import HIGHEST_SHARE, StrainMap
+from haselab.models.actuator.strain_map import LARGEST_FEEDTHROUGH, StrainMap
 from haselab.models.rational import RationalModel
 from haselab.rig.chip import ChipDesign
 from haselab.rig.twin.config import TwinConfig
@@ -40,6 +40,7 @@ __all__ = [
 ]
 
 _FROM_S = -1.0  # of the step: from here on the responses are compared
+_SAME_FEEDTHROUGH = 0.05
 _SOFTENED = 0.01  # loss of stiffness that is a cause
 _MAP_POINTS = 65  # voltages at which the strain map is checked
 _CAPACITANCES = 10_001  # at which the ends of the step are searched
@@ -128,11 +129,11 @@ class StepCase:
 
     @property
     def loop(self) -> LoopSetting:
-        """The chip's loop, with the direct share of the actuator file."""
+        """The chip's loop, with the feedthrough of the actuator file."""
         settings = self.design.settings
         limits = Saturation(settings.strain_low, settings.strain_high)
         setting = LoopSetting(FAST.rate_hz, CHIP_DELAY_S, limits)
-        return with_direct_share(setting, self.design.tables)
+        return with_feedthrough(setting, self.design.tables)
 
     def differences(self, one: LoopRun, other: LoopRun) -> NDArray[np.float64]:
         """Difference of two responses at each time, as a fraction of the step.
@@ -196,7 +197,7 @@ def predicted_loop(
     white = None
     if noise:
         white = np.random.default_rng(case.seed).normal(0.0, case.noise_std, run.time_s.size)
-    setting = replace(setting, direct_share=case.loop.direct_share)
+    setting = replace(setting, feedthrough=case.loop.feedthrough)
     trace = simulate_loop(plant, case.gains, run.reference, setting, measurement_noise=white)
     return replace(run, strain=trace.y)
 
@@ -264,20 +265,39 @@ def check_stable(case: StepCase) -> None:
             f"with a delay of {1e3 * CHIP_DELAY_S:.3g} ms. Design it again with --rate-hz and "
             f"--delay-s: {case.design.path}"
         )
-    share = _direct_share(case, case.plan.before)
-    on_twin = replace(case.loop, direct_share=share, direct_range=None)
+    twins = _feedthrough(case, case.plan.before)
+    on_twin = replace(case.loop, feedthrough=twins, feedthrough_range=None)
     if not loop_margins(_linear(case, case.plan.before), case.gains, on_twin).stable:
         raise ResultError(
-            f"The loop is unstable on this twin: {_two_plants(case)}. Choose the twin of this "
-            f"actuator with --twin or --reading: {case.design.path}"
+            f"The loop is unstable on this twin: {_two_plants(case)}{_twins_feedthrough(case)}. "
+            f"Choose the twin of this actuator with --twin or --reading: {case.design.path}"
         )
+
+
+def _feedthrough_text(case: StepCase) -> str:
+    """Range of the feedthrough, if the loop has one."""
+    if case.loop.feedthrough_range is None:
+        return ""
+    low, high = case.loop.feedthrough_range
+    return f" or a feedthrough of {low:.2g} to {high:.2g}"
+
+
+def _twins_feedthrough(case: StepCase) -> str:
+    """Feedthrough of the twin and of the file, if they differ."""
+    twins, known = _feedthrough(case, case.plan.before), case.loop.feedthrough
+    if abs(twins - known) < _SAME_FEEDTHROUGH:
+        return ""
+    return (
+        f", and {twins:.2g} of its sensed strain follows the drive at once, but the file states "
+        f"feedthrough = {known:.2g} in [sensing.strain_map]"
+    )
 
 
 def _unstable_within_spread(case: StepCase) -> str:
     return (
         f"with a natural frequency that differs from [model] by {100.0 * case.spread:.3g} % "
-        "(frequency_spread), the loop is unstable, so any difference would be tolerated. Design "
-        "the controller again with haselab design"
+        f"(frequency_spread){_feedthrough_text(case)}, the loop is unstable, so any difference "
+        "would be tolerated. Design the controller again with haselab design"
     )
 
 
@@ -352,11 +372,11 @@ def _point(case: StepCase, strain: float) -> tuple[OperatingPoint, float]:
     return point, corrected
 
 
-def _direct_share(case: StepCase, strain: float) -> float:
-    """Direct share of the softened twin where the model reaches a strain."""
+def _feedthrough(case: StepCase, strain: float) -> float:
+    """Feedthrough of the softened twin where the model reaches a strain."""
     point, _ = _point(case, strain)
-    share = direct_share(case.config.law, point.length_m, point.voltage_v, point.gain_m_per_v)
-    return float(np.clip(share, -HIGHEST_SHARE, HIGHEST_SHARE))
+    found = feedthrough(case.config.law, point.length_m, point.voltage_v, point.gain_m_per_v)
+    return float(np.clip(found, -LARGEST_FEEDTHROUGH, LARGEST_FEEDTHROUGH))
 
 
 def _gain_v(case: StepCase) -> float:

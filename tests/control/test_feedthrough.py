@@ -22,7 +22,7 @@ from haselab.control import (
     simulate_loop,
     trace_ensemble,
 )
-from haselab.control.direct_share import with_share
+from haselab.control.feedthrough import with_measured_feedthrough
 from haselab.control.plants.general_loops import loop_variants, plant_output, trace_general
 from haselab.control.stability.margins import loop_margins
 from haselab.models.plant import Plant, SlowMode
@@ -44,7 +44,7 @@ def test_the_loop_measures_the_share_of_the_drive_and_the_rest_of_the_output(
 ) -> None:
     """By the exact response of the plant alone to the drive that the loop put out."""
     plant = replace(_PLANT, natural_frequency_rad_s=omega, damping_ratio=zeta)
-    setting = LoopSetting(measurement_delay_s=delay_s, direct_share=share)
+    setting = LoopSetting(measurement_delay_s=delay_s, feedthrough=share)
     trace = simulate_loop(plant, PidGains(0.0, 2.0), [0.02] * 400, setting)
     late_s = np.arange(400) / 100.0 - delay_s
     moved = plant.simulate(trace.u, 100.0, late_s)
@@ -57,7 +57,7 @@ def test_the_loop_measures_the_share_of_the_drive_and_the_rest_of_the_output(
 
 @pytest.mark.parametrize("share", [-0.3, 0.2, 0.6, 0.9])
 def test_a_general_plant_and_many_loops_measure_the_same(share: float) -> None:
-    setting = LoopSetting(measurement_delay_s=0.0062, direct_share=share)
+    setting = LoopSetting(measurement_delay_s=0.0062, feedthrough=share)
     desired = np.full(500, 0.02)
     one = simulate_loop(_PLANT, _GAINS, desired, setting)
     general, _ = trace_general(RationalModel.from_plant(_PLANT), [_GAINS], desired, setting)
@@ -71,7 +71,7 @@ def test_a_general_plant_and_many_loops_measure_the_same(share: float) -> None:
 @pytest.mark.parametrize("share", [-0.3, 0.2, 0.6, 0.9])
 def test_margins_are_those_at_which_the_simulated_loop_starts_to_oscillate(share: float) -> None:
     """Just below the gain margin the loop settles, and just above it grows."""
-    setting = LoopSetting(measurement_delay_s=0.0062, direct_share=share)
+    setting = LoopSetting(measurement_delay_s=0.0062, feedthrough=share)
     found = loop_margins(_PLANT, _GAINS, setting)
     general = loop_margins(RationalModel.from_plant(_PLANT), _GAINS, setting)
     assert found.stable
@@ -95,7 +95,7 @@ def test_a_share_of_one_half_is_half_the_response_and_half_the_gain() -> None:
     omega = np.array([0.01, 300.0])
     plain, shared = (
         loop_response(Plant(0.8, 20.0, 0.5), PidGains(1.0, 0.0), omega, loop_delay_s=0.01,
-                      rate_hz=100.0, direct_share=share)
+                      rate_hz=100.0, feedthrough=share)
         for share in (0.0, 0.5)
     )  # fmt: skip
     assert abs(shared[0] / plain[0] - 1.0) < 1e-3
@@ -108,7 +108,7 @@ def test_a_pid_designed_without_the_share_can_be_unstable_and_one_with_it_is_not
     gains = PidGains(1.499, 38.6, 0.0438, 0.05404)
     setting = LoopSetting(measurement_delay_s=0.00565)
     assert loop_margins(plant, gains, setting).phase_margin_deg > 54.0
-    shared = replace(setting, direct_share=0.7, direct_range=(0.6, 0.9))
+    shared = replace(setting, feedthrough=0.7, feedthrough_range=(0.6, 0.9))
     assert not loop_margins(plant, gains, shared).stable
     found = design_pid(plant, DesignSpec(), shared, rng=np.random.default_rng(1))
     for one, loop in loop_variants(plant, shared, found.spec.frequency_spread):
@@ -122,7 +122,7 @@ def test_a_pid_designed_without_the_share_can_be_unstable_and_one_with_it_is_not
 def test_the_predicted_step_is_that_of_the_strain_and_not_of_what_is_sensed() -> None:
     """With a share of 0.95 a ringing actuator looks calm to its loop."""
     plant = Plant(1.0, 40.0, 0.05)
-    setting = LoopSetting(direct_share=0.95)
+    setting = LoopSetting(feedthrough=0.95)
     gains = PidGains(0.0, 20.0)
     trace = simulate_loop(plant, gains, [0.02] * 1000, setting)
     sensed_overshoot = trace.measured.max() / 0.02 - 1.0
@@ -135,20 +135,20 @@ def test_the_predicted_step_is_that_of_the_strain_and_not_of_what_is_sensed() ->
 
 
 def test_a_measured_share_has_a_range_of_two_deviations_within_what_a_loop_can_have() -> None:
-    found = with_share(LoopSetting(), Estimate.normal(0.9, 0.05, ""))
-    assert found.direct_share == 0.9
-    assert found.direct_range == pytest.approx((0.8, 0.98))
-    assert with_share(LoopSetting(), None) == LoopSetting()
-    certain = with_share(LoopSetting(), Estimate.normal(0.4, 0.0, ""))
-    assert certain.direct_range is None
+    found = with_measured_feedthrough(LoopSetting(), Estimate.normal(0.9, 0.05, ""))
+    assert found.feedthrough == 0.9
+    assert found.feedthrough_range == pytest.approx((0.8, 0.98))
+    assert with_measured_feedthrough(LoopSetting(), None) == LoopSetting()
+    certain = with_measured_feedthrough(LoopSetting(), Estimate.normal(0.4, 0.0, ""))
+    assert certain.feedthrough_range is None
     assert len(loop_variants(_PLANT, certain, 0.1)) == 3
 
 
 def test_impossible_shares_are_refused() -> None:
-    with pytest.raises(InputError, match=r"direct_share = 1; it must be -0\.98 to 0\.98"):
-        LoopSetting(direct_share=1.0)
-    with pytest.raises(LimitError, match="a direct share needs a sampled loop"):
-        margins(_PLANT, _GAINS, loop_delay_s=0.0, rate_hz=None, direct_share=0.5)
+    with pytest.raises(InputError, match=r"feedthrough = 1; it must be -0\.98 to 0\.98"):
+        LoopSetting(feedthrough=1.0)
+    with pytest.raises(LimitError, match="a feedthrough needs a sampled loop"):
+        margins(_PLANT, _GAINS, loop_delay_s=0.0, rate_hz=None, feedthrough=0.5)
     integrating = RationalModel((1.0,), (1.0, 1.0, 0.0))
     with pytest.raises(InputError, match="the model integrates"):
-        loop_margins(integrating, _GAINS, LoopSetting(direct_share=0.5))
+        loop_margins(integrating, _GAINS, LoopSetting(feedthrough=0.5))

@@ -1,4 +1,4 @@
-"""The direct share of a sensed strain, from records of fast motion."""
+"""The feedthrough of a sensed strain, from records of fast motion."""
 
 from __future__ import annotations
 
@@ -7,7 +7,7 @@ import pytest
 
 from haselab.base import InputError
 from haselab.models.plant import Plant, SlowMode
-from haselab.sensing.direct_share import fit_direct_share
+from haselab.sensing.feedthrough import fit_feedthrough
 
 _PLANT = Plant(0.9, 40.0, 0.15, 0.0, (SlowMode(0.1, 3.0),))
 _RUNS = 40
@@ -34,7 +34,7 @@ def _chirp(
 @pytest.mark.parametrize("share", [0.0, 0.3, 0.9])
 def test_the_share_is_within_its_interval_and_known_to_two_per_mille(share: float) -> None:
     rng = np.random.default_rng(1)
-    found = [fit_direct_share(*_chirp(share, rng)) for _ in range(_RUNS)]
+    found = [fit_feedthrough(*_chirp(share, rng)) for _ in range(_RUNS)]
     inside = [one.ci95[0] <= share <= one.ci95[1] for one in found]
     errors = [one.value - share for one in found]
     # 95 % of 40 with their binomial scatter: at least 33 in 99.9 % of the cases.
@@ -45,7 +45,7 @@ def test_the_share_is_within_its_interval_and_known_to_two_per_mille(share: floa
 def test_another_time_and_zero_of_the_camera_do_not_look_like_a_share() -> None:
     """2 ms between both measurements: without the fitted time it would be a share of 0.05."""
     rng = np.random.default_rng(2)
-    found = fit_direct_share(*_chirp(0.0, rng, late_s=0.002))
+    found = fit_feedthrough(*_chirp(0.0, rng, late_s=0.002))
     assert abs(found.value) < 0.01
     assert found.value == pytest.approx(0.0, abs=4.0 * found.std + 0.005)
 
@@ -54,17 +54,17 @@ def test_lost_values_are_left_out_and_too_few_are_refused() -> None:
     rng = np.random.default_rng(3)
     time_s, sensed, static, frame_s, strain, length = _chirp(0.4, rng)
     sensed[::3] = np.nan
-    found = fit_direct_share(time_s, sensed, static, frame_s, strain, length)
+    found = fit_feedthrough(time_s, sensed, static, frame_s, strain, length)
     assert found.value == pytest.approx(0.4, abs=0.01)
     sensed[49:] = np.nan
     with pytest.raises(InputError, match="sensed strains are within the measured ones, but 50"):
-        fit_direct_share(time_s, sensed, static, frame_s, strain, length)
+        fit_feedthrough(time_s, sensed, static, frame_s, strain, length)
 
 
 def test_noise_of_the_camera_does_not_look_like_a_share() -> None:
     """By least squares, this noise of half the motion made 0.3 a share of 0.4 or more."""
     rng = np.random.default_rng(4)
-    found = [fit_direct_share(*_chirp(0.3, rng, noise=4e-3)) for _ in range(_RUNS)]
+    found = [fit_feedthrough(*_chirp(0.3, rng, noise=4e-3)) for _ in range(_RUNS)]
     inside = sum(one.ci95[0] <= 0.3 <= one.ci95[1] for one in found)
     errors = np.array([one.value - 0.3 for one in found])
     assert abs(errors.mean()) < 3.0 * errors.std() / np.sqrt(_RUNS) + 1e-3

@@ -1,4 +1,4 @@
-"""How much of a sensed strain follows the voltage at once, from a record of fast motion."""
+"""Feedthrough of the voltage to a sensed strain, from a record of fast motion."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ from haselab.base import Estimate, InputError
 if TYPE_CHECKING:
     from scipy.interpolate import CubicSpline
 
-__all__ = ["fit_direct_share"]
+__all__ = ["fit_feedthrough"]
 
 Floats = NDArray[np.float64]
 _FEWEST = 50  # values
@@ -22,7 +22,7 @@ _MAP_STD = 0.01  # by errors of the map; 0.011 (rms) in 7 studies of Peano and c
 _PARTS = 20  # of the record, each of which is left out once
 
 
-def fit_direct_share(
+def fit_feedthrough(
     time_s: Floats,
     sensed: Floats,
     static: Floats,
@@ -30,7 +30,7 @@ def fit_direct_share(
     strain: Floats,
     modelled: Floats,
 ) -> Estimate:
-    r"""Fit the share of a sensed strain that follows the voltage without the actuator's dynamics.
+    r"""Fit the fraction of a sensed strain that follows the voltage without the plant's dynamics.
 
     The map from capacitance to strain holds for slow changes. In fast motion, a capacitance that
     depends on the voltage besides the length gives
@@ -39,8 +39,8 @@ def fit_direct_share(
 
     with the measured strain $y$ and the strain $y_\mathrm{static}$ that the present voltage would
     hold. $f$ has an offset and all terms of second and third degree, because the motion of a
-    record may be large; $\tau$ is the time difference of both measurements. The share is that of
-    small motion about strain 0, $d = c / (b + c)$.
+    record may be large; $\tau$ is the time difference of both measurements. The fraction is that
+    of small motion about strain 0, $d = c / (b + c)$.
 
     Args:
         time_s: of the sensed strains. Shape `(N,)`.
@@ -50,9 +50,9 @@ def fit_direct_share(
         strain: measured by camera or sensor. Shape `(F,)`.
         modelled: the same strain by a model that was fitted to it and depends on the drive alone.
             It is the instrument of the fit: noise of the measured strain, which is in both sides of
-            the equation, would look like a share. Shape `(F,)`.
+            the equation, would look like feedthrough. Shape `(F,)`.
     Returns:
-        The share d; 0 for a capacitance that depends on the length alone. Its standard deviation
+        The fraction d; 0 for a capacitance that depends on the length alone. Its standard deviation
         is that of the jackknife with 20 parts of the record, which allows for correlated residuals,
         and contains the interpolation between the frames and errors of the map (0.01).
     Raises:
@@ -63,7 +63,7 @@ def fit_direct_share(
         >>> t = np.arange(0.0, 10.0, 0.01)
         >>> static = np.sin(t**2)
         >>> length = np.sin(t**2 - 0.5 * t) / (1.0 + 0.1 * t)
-        >>> found = fit_direct_share(t, 0.7 * length + 0.3 * static, static, t, length, length)
+        >>> found = fit_feedthrough(t, 0.7 * length + 0.3 * static, static, t, length, length)
         >>> round(found.value, 3)
         0.3
     """
@@ -77,15 +77,15 @@ def fit_direct_share(
         )
     time_s, sensed, static = time_s[inside], sensed[inside], static[inside]
     frames = np.stack([strain, modelled], axis=1)
-    share, std = _fitted(CubicSpline(frame_s, frames), time_s, sensed, static)
+    fraction, std = _fitted(CubicSpline(frame_s, frames), time_s, sensed, static)
     # With half the frames the error of a cubic spline is 16 times as large.
     kept = np.r_[0 : frame_s.size - 1 : 2, frame_s.size - 1]
     coarse, _ = _fitted(CubicSpline(frame_s[kept], frames[kept]), time_s, sensed, static)
-    return Estimate.normal(share, math.hypot(std, (coarse - share) / 15.0, _MAP_STD), "")
+    return Estimate.normal(fraction, math.hypot(std, (coarse - fraction) / 15.0, _MAP_STD), "")
 
 
 def _fitted(at: CubicSpline, time_s: Floats, sensed: Floats, static: Floats) -> tuple[float, float]:
-    """Share and its standard deviation, with measured and modelled strain between the frames."""
+    """Fraction and its standard deviation, with measured and modelled strain between the frames."""
     strains, rates = at(time_s), at(time_s, 1)
     size, speed = float(np.abs(static).max()), float(np.abs(rates[:, 1]).max())
     measured, instruments = (
@@ -95,19 +95,19 @@ def _fitted(at: CubicSpline, time_s: Floats, sensed: Floats, static: Floats) -> 
     parts = [slice(*ends) for ends in itertools.pairwise(edges)]
     left = np.stack([instruments[part].T @ measured[part] for part in parts])
     right = np.stack([instruments[part].T @ sensed[part] for part in parts])
-    share = _share(left.sum(axis=0), right.sum(axis=0))
+    fraction = _fraction(left.sum(axis=0), right.sum(axis=0))
     others = np.array(
         [
-            _share(left.sum(axis=0) - own_left, right.sum(axis=0) - own_right)
+            _fraction(left.sum(axis=0) - own_left, right.sum(axis=0) - own_right)
             for own_left, own_right in zip(left, right, strict=True)
         ]
     )
     spread = (_PARTS - 1.0) / _PARTS * float(((others - others.mean()) ** 2).sum())
-    return share, math.sqrt(spread)
+    return fraction, math.sqrt(spread)
 
 
-def _share(left: Floats, right: Floats) -> float:
-    """Share by the sums of the normal equations."""
+def _fraction(left: Floats, right: Floats) -> float:
+    """Fraction by the sums of the normal equations."""
     by_length, by_voltage = (np.linalg.pinv(left) @ right)[:2].tolist()
     return float(by_voltage / (by_length + by_voltage))
 

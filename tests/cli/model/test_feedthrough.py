@@ -1,4 +1,4 @@
-"""The direct share of an actuator file: stated, measured by a study, or by the physical model."""
+"""The feedthrough of an actuator file: stated, measured by a study, or by the physical model."""
 
 from __future__ import annotations
 
@@ -15,14 +15,14 @@ from haselab.actuators import (
     DeaStack,
     PeanoHasel,
     PlanarHasel,
-    direct_share,
     equilibrium_m,
+    feedthrough,
     linearise,
 )
 from haselab.base import InputError
 from haselab.cli.main import cli
 from haselab.control import LoopSetting, Saturation
-from haselab.control.direct_share import with_direct_share
+from haselab.control.feedthrough import with_feedthrough
 from haselab.controllers import KnownActuator
 from haselab.models.actuator import ActuatorTables
 
@@ -66,7 +66,7 @@ def test_the_share_is_what_a_held_length_keeps_of_a_change(law: ActuatorLaw, loa
     )
     middle_v = 0.5 * (low_v + high_v)
     point = linearise(law, middle_v, load_n, load_n / 9.81)
-    found = direct_share(law, point.length_m, middle_v, point.gain_m_per_v)
+    found = feedthrough(law, point.length_m, middle_v, point.gain_m_per_v)
     # 10 V change both slopes by less than 1 %, and the softening of a new elastomer one of them
     assert found == pytest.approx((held - before) / (after - before), rel=0.05, abs=1e-3)
     assert (found > 0.1) == isinstance(law, PeanoHasel | CurlingHasel)
@@ -78,11 +78,11 @@ def test_a_known_actuator_has_the_share_of_its_law() -> None:
     strain = 0.5 * (low + high)
     volt = 5000.0 * known.static_drive_v(strain)
     point = linearise(known.law, volt, 0.1 * 9.80665, 0.1)
-    wanted = direct_share(known.law, point.length_m, volt, point.gain_m_per_v)
-    assert known.direct_share(strain) == pytest.approx(wanted, rel=0.02)
-    assert known.direct_share(high) > known.direct_share(low)  # largest where it is slack
+    wanted = feedthrough(known.law, point.length_m, volt, point.gain_m_per_v)
+    assert known.feedthrough(strain) == pytest.approx(wanted, rel=0.02)
+    assert known.feedthrough(high) > known.feedthrough(low)  # largest where it is slack
     planar = KnownActuator(PlanarHasel(), 0.25, 0.0965, 0.0, 1.6, 5000.0)
-    assert planar.direct_share(0.0) == 0.0
+    assert planar.feedthrough(0.0) == 0.0
 
 
 def test_the_margins_of_a_file_are_those_with_its_share(tmp_path: Path) -> None:
@@ -90,26 +90,26 @@ def test_the_margins_of_a_file_are_those_with_its_share(tmp_path: Path) -> None:
     plain = _margins(path, _MODEL + _MAP)
     assert plain["stable"]
     assert plain["phase_margin_deg"] == pytest.approx(54.6, abs=0.3)
-    shared = _margins(path, _MODEL + _MAP + "direct_share = 0.8\ndirect_share_std = 0.01\n")
+    shared = _margins(path, _MODEL + _MAP + "feedthrough = 0.8\nfeedthrough_std = 0.01\n")
     assert not shared["stable"]
-    text = _MODEL + _MAP + "direct_share = 1.2\n"
+    text = _MODEL + _MAP + "feedthrough = 1.2\n"
     path.write_text(text, encoding="utf-8")
     refused = CliRunner().invoke(cli, ["margins", str(path), *_GAINS])
     assert isinstance(refused.exception, InputError)
-    assert "sensing.strain_map.direct_share: must be less than or equal to 0.98" in str(
+    assert "sensing.strain_map.feedthrough: must be less than or equal to 0.98" in str(
         refused.exception
     )
 
 
 def test_a_design_reports_its_share_and_keeps_the_margins_with_it(tmp_path: Path) -> None:
     path = tmp_path / "actuator.toml"
-    share = "direct_share = 0.8\ndirect_share_std = 0.01\n"
+    share = "feedthrough = 0.8\nfeedthrough_std = 0.01\n"
     path.write_text(_MODEL + _MAP + share, encoding="utf-8")
     found = CliRunner().invoke(cli, ["design", str(path), "--limits", "-0.01", "0.01", "--json"])
     assert found.exit_code == 0, found.output
     answer = json.loads(found.stdout)
-    assert answer["direct_share"] == 0.8
-    assert answer["direct_range"] == pytest.approx([0.78, 0.82])
+    assert answer["feedthrough"] == 0.8
+    assert answer["feedthrough_range"] == pytest.approx([0.78, 0.82])
     again = CliRunner().invoke(cli, ["margins", str(path), "--json"])
     assert json.loads(again.stdout)["stable"]
     assert json.loads(again.stdout)["phase_margin_deg"] == pytest.approx(
@@ -127,14 +127,14 @@ def test_the_share_of_a_physical_model_is_that_of_its_limits() -> None:
         "model": {"physical": physical},
     })  # fmt: skip
     setting = LoopSetting(saturation=Saturation(low + 0.01, min(high, 0.005)))
-    found = with_direct_share(setting, tables)
-    assert found.direct_range is not None
-    shares = [known.direct_share(s) for s in np.linspace(low + 0.01, min(high, 0.005), 9)]
-    assert found.direct_range == pytest.approx((min(shares), max(shares)), rel=1e-6)
-    assert found.direct_range[0] < found.direct_share < found.direct_range[1]
+    found = with_feedthrough(setting, tables)
+    assert found.feedthrough_range is not None
+    shares = [known.feedthrough(s) for s in np.linspace(low + 0.01, min(high, 0.005), 9)]
+    assert found.feedthrough_range == pytest.approx((min(shares), max(shares)), rel=1e-6)
+    assert found.feedthrough_range[0] < found.feedthrough < found.feedthrough_range[1]
     wrong = tables.model_copy(deep=True)
     bad = ActuatorTables.model_validate({
         **wrong.model_dump(exclude_none=True),
         "model": {"physical": physical | {"status": "model error"}},
     })  # fmt: skip
-    assert with_direct_share(setting, bad) == setting
+    assert with_feedthrough(setting, bad) == setting

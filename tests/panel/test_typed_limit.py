@@ -185,7 +185,7 @@ def test_the_strain_of_a_voltage_controller_is_limited_by_the_physical_model(
     answer = bench.live.do("loop", "page", {"strain": 0.4})
     assert bench.live.state.reference == pytest.approx(reached[1], rel=1e-9)
     assert bench.live.state.reference != pytest.approx(wide.voltage_map.reach((0, 0.5), 0, 1.2)[1])
-    assert "A drive of -1.2 to 1.2 V reaches no strain of 40 %" in answer["note"]
+    assert "A drive of -1.2 to 1.2 V does not reach a strain of 40 %" in answer["note"]
     far = replace(wide, saturation=Saturation(0.45, 0.5))
     with pytest.raises(LimitError, match=r"physical model, a drive of 0 to 1\.2 V reaches"):
         far.within(-1.2, 1.2)

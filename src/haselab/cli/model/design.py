@@ -225,7 +225,7 @@ def _own_design(
         if strains != (low, high):
             click.echo(
                 f"haselab: The limits are strains of {strains[0]:.3g} to {strains[1]:.3g} instead "
-                f"of {low:.3g} to {high:.3g}, which the drive reaches: for the others, the drive is "
+                f"of {low:.3g} to {high:.3g}, which the drive reaches: for the rest, the drive is "
                 "near 0 V, where the pouches are slack and the capacitance hardly depends on the "
                 f"length. {model}",
                 err=True,

@@ -40,10 +40,10 @@ SECTIONS: dict[str, tuple[Measurement, ...]] = {
         Measurement("identification.hysteresis", quick={"runs": 8}),
         Measurement(
             "identification.physical_model",
-            quick={"twins": 0, "starts": 2, "planted": 1, "short": 3},
+            quick={"twins": 0, "starts": 2, "planted": 0, "short": 3, "bad": 1},
         ),
         Measurement("identification.prediction", quick={"twins": (), "short": 1}),
-        Measurement("identification.hard_twins", quick={"seeds": 1}),
+        Measurement("identification.hard_twins", quick={"twins": ("retention",), "seeds": 1}),
     ),
     "random-plants": (
         Measurement("identification.random_plants", quick={"plants": 200}),
@@ -78,11 +78,11 @@ SECTIONS: dict[str, tuple[Measurement, ...]] = {
     "panel": (
         Measurement(
             "rig.panel",
-            quick={"presses": 100, "seconds": 10.0, "armed_presses": 20},
+            quick={"presses": 50, "seconds": 5.0, "armed_presses": 10},
             full={"seconds": 1800.0},
         ),
-        Measurement("rig.panel_chromium", quick={"presses": 100}),
-        Measurement("rig.panel_disturbance", quick={"seconds": 20.0, "rounds": 1}),
+        Measurement("rig.panel_chromium", quick={"presses": 50}),
+        Measurement("rig.panel_disturbance", quick={"seconds": 10.0, "rounds": 1}),
     ),
     "command": (Measurement("command"),),
 }

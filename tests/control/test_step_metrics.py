@@ -53,6 +53,18 @@ def test_the_raw_rise_of_a_ringing_step_is_that_of_its_first_swing():
     assert "so its rise time" in found.trials[0].remark
 
 
+@pytest.mark.parametrize("phase", [0.0, 0.5 * math.pi, math.pi, 1.5 * math.pi])
+def test_the_rise_of_a_slow_step_with_ringing_has_a_value_at_every_phase(phase):
+    """Whether the averaged or the raw rise is the longer one is chance if it lasts many periods."""
+    t = np.arange(2000) / 100.0
+    smooth = 1.0 - np.exp(-t / 1.07)
+    ring = 0.05 * np.exp(-2.0 * t) * (np.cos(33.0 * t + phase) - math.cos(phase))
+    found = step_metrics(*record(STEP * (smooth + ring), 100.0))
+    assert found.ringing is not None
+    # Averaging is accurate to 5 % of a rise of two or more periods.
+    assert found.rise_time_s.value == pytest.approx(1.07 * LN9, rel=0.05)
+
+
 def test_a_swing_that_creep_hides_from_the_overshoot_is_in_the_excess_over_the_reference():
     """Both swing far beyond the reference; in open loop, creep ends above the first peak."""
     t = np.arange(4000) / 200.0

@@ -224,7 +224,7 @@ def test_a_map_that_reaches_exactly_the_highest_drive_is_used(settings: ChipSett
         ({"drive_high_v": 0.9}, r"zero strain, which needs .* V by the voltage map, but the"),
         ({"drive_high_v": 2.5}, "below the converter's"),
         ({"kp": math.nan}, "must be finite"),
-        ({"strain_low": 0.2}, "which is no range"),
+        ({"strain_low": 0.2}, "no range is left"),
         ({"voltage_map": (0.4, -30.0, 0.4, 30.0)}, "must rise, or fall, everywhere"),
         # 1.9 V times 5000 through the monitor is 19 V, or 0.95 V * 0.15 / (5 V / 1024) < 2 codes
         (

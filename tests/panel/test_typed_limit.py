@@ -8,6 +8,7 @@ from typing import Any
 import numpy as np
 import pytest
 
+from haselab.actuators import GRAVITY_M_S2, equilibrium_m
 from haselab.api.design import Actuator
 from haselab.base import LimitError
 from haselab.control import Saturation
@@ -27,7 +28,8 @@ from haselab.safety.state_machine import Safety, SafetySettings
 from haselab.safety.watchdog.settings import WatchdogSettings
 
 HZ = twin_of_reading("hz")
-KNOWN = KnownActuator(HZ.law, 0.25, 0.051, -1.8, 1.8, 5000.0)
+ZERO_M = equilibrium_m(HZ.law, 4900.0, 0.25 * GRAVITY_M_S2)  # as in the actuator file
+KNOWN = KnownActuator(HZ.law, 0.25, ZERO_M, -1.8, 1.8, 5000.0)
 BLOCKS = 60
 
 
@@ -169,6 +171,26 @@ def test_a_loop_whose_strains_need_more_than_the_limit_can_be_closed(
     assert max(np.abs(drives_v)) <= limit_v
     with pytest.raises(LimitError, match="The desired strain is"):
         bench.live.do("loop", "page", {"strain": 0.28})
+
+
+def test_the_strain_of_a_voltage_controller_is_limited_by_the_physical_model(
+    make: Any, loop: LoopSettings
+) -> None:
+    """The voltage map, of another load or temperature, does not act in such a loop."""
+    known = replace(KNOWN, low_v=0.0)
+    reached = replace(known, high_v=1.2).reachable()
+    wide = replace(loop, controller=ALTERNATING, actuator=known, saturation=Saturation(-0.05, 0.5))
+    bench = make(wide)
+    bench.arm(1.2)
+    answer = bench.live.do("loop", "page", {"strain": 0.4})
+    assert bench.live.state.reference == pytest.approx(reached[1], rel=1e-9)
+    assert bench.live.state.reference != pytest.approx(wide.voltage_map.reach((0, 0.5), 0, 1.2)[1])
+    assert "A drive of -1.2 to 1.2 V does not reach a strain of 40 %" in answer["note"]
+    far = replace(wide, saturation=Saturation(0.45, 0.5))
+    with pytest.raises(LimitError, match=r"physical model, a drive of 0 to 1\.2 V reaches"):
+        far.within(-1.2, 1.2)
+    unknown = replace(wide, actuator=None)
+    assert unknown.within(-1.2, 1.2) == unknown
 
 
 def test_a_loop_that_no_drive_within_the_limit_reaches_is_refused(

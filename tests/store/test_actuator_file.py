@@ -211,7 +211,7 @@ def test_a_writer_waits_for_one_in_another_program(path, monkeypatch):
     ) as other:
         assert other.stdout.readline() == "has it\n"
         monkeypatch.setattr(actuator_file, "_WAIT_S", 0.05)
-        with pytest.raises(InputError, match="another program has written this file"):
+        with pytest.raises(InputError, match="another program has locked this file"):
             write_section(path, "model", {"gain": 2.0}, None)
         assert path.read_text() == TYPED
         monkeypatch.setattr(actuator_file, "_WAIT_S", 60.0)

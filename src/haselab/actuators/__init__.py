@@ -5,7 +5,12 @@ from haselab.actuators.dea_stack import DeaStack
 from haselab.actuators.law import VACUUM_F_PER_M, ActuatorLaw, LawValues, Parameter, parameter
 from haselab.actuators.losses import DRIFT_LIMITS, DRIFT_TIMES, DRIFT_UNITS, DRIFTS, Circuit, Losses
 from haselab.actuators.motion import ActuatorState, rates
-from haselab.actuators.operating_point import OperatingPoint, equilibrium_m, linearise
+from haselab.actuators.operating_point import (
+    OperatingPoint,
+    equilibrium_m,
+    feedthrough,
+    linearise,
+)
 from haselab.actuators.peano_hasel import PeanoHasel
 from haselab.actuators.planar_hasel import PlanarHasel
 from haselab.actuators.pouch import Pouch
@@ -53,6 +58,7 @@ __all__ = [
     "actuator_law",
     "draw_parameters",
     "equilibrium_m",
+    "feedthrough",
     "law_table",
     "linearise",
     "measured_parameters",

@@ -12,7 +12,7 @@ from haselab.actuators.law import ActuatorLaw
 from haselab.base import LimitError
 from haselab.base.root import root
 
-__all__ = ["OperatingPoint", "equilibrium_m", "linearise"]
+__all__ = ["OperatingPoint", "equilibrium_m", "feedthrough", "linearise"]
 
 Floats = NDArray[np.float64]
 Complexes = NDArray[np.complex128]
@@ -138,6 +138,34 @@ def equilibrium_m(
             )
         length = rest
     return length
+
+
+def feedthrough(law: ActuatorLaw, length_m: float, voltage_v: float, gain_m_per_v: float) -> float:
+    """Fraction of a steady-state change of the capacitance that a held length does not prevent.
+
+    Args:
+        law: of the actuator.
+        length_m: at equilibrium.
+        voltage_v: at equilibrium.
+        gain_m_per_v: change of the equilibrium length per change of the voltage.
+    Returns:
+        What the change of the voltage at constant length contributes, divided by the whole change;
+        0 for a capacitance that depends on the length alone.
+    Example:
+        >>> from haselab.actuators import PeanoHasel, PlanarHasel
+        >>> for law, load_n in ((PlanarHasel(), 2.45), (PeanoHasel(), 1.0)):
+        ...     point = linearise(law, 5000.0, load_n, load_n / 9.81)
+        ...     print(round(feedthrough(law, point.length_m, 5000.0, point.gain_m_per_v), 3))
+        0.0
+        0.25
+    """
+    step_m, step_v = _STEP * law.free_length_m, max(_STEP * abs(voltage_v), 1e-3)
+    lengths = length_m + step_m * np.array([-1.0, 1.0])
+    volts = voltage_v + step_v * np.array([-1.0, 1.0])
+    by_length = float(np.diff(law.differential_capacitance_f(lengths, voltage_v))[0]) / step_m
+    by_volt = float(np.diff(law.differential_capacitance_f(length_m, volts))[0]) / step_v
+    whole = by_volt + by_length * gain_m_per_v
+    return by_volt / whole if by_volt else 0.0
 
 
 def linearise(

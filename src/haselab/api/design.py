@@ -43,6 +43,7 @@ def design(
     rate_hz: float = _USUAL.rate_hz,
     delay_s: float = _USUAL.measurement_delay_s,
     probability: float | None = None,
+    feedthrough: float = 0.0,
     seed: int = 0,
 ) -> Design:
     """Design a PI or PID controller for a model, with margins that include the loop's delay.
@@ -60,6 +61,7 @@ def design(
         rate_hz: updates of the loop a second, in Hz.
         delay_s: age of a measurement when the output computed from it takes effect, in s.
         probability: share of the plausible plants that has to keep the margins; a fit only.
+        feedthrough: of the drive to the sensed strain, see `LoopSetting`; -0.98 to 0.98.
         seed: of the search.
     Returns:
         Gains, margins and the predicted step; `shortfalls` names the demands that are not met.
@@ -76,7 +78,8 @@ def design(
     known = model.posterior if isinstance(model, TransferFit) else model
     plant = known.nominal if isinstance(known, PlantPosterior) else known
     range_ = usual_limits(plant) if limits is None else Saturation(*limits)
-    loop, rng = LoopSetting(rate_hz, delay_s, range_), generator(seed)
+    loop = LoopSetting(rate_hz, delay_s, range_, feedthrough=feedthrough)
+    rng = generator(seed)
     return design_controller(
         known, demands, loop, rng=rng, structure=controller, probability=probability
     )

@@ -13,8 +13,13 @@ from numpy.typing import NDArray
 from haselab.base import InputError
 from haselab.control.ensemble import trace_ensemble
 from haselab.control.gains import PidGains
-from haselab.control.plants.general import AnyPlant, PlantScale, frequency_variants
-from haselab.control.plants.general_loops import closed_loop_poles, trace_general
+from haselab.control.plants.general import AnyPlant, PlantScale
+from haselab.control.plants.general_loops import (
+    closed_loop_poles,
+    loop_variants,
+    plant_output,
+    trace_general,
+)
 from haselab.control.plants.modes import SampledLoops
 from haselab.control.reach import default_step
 from haselab.control.ringing import Ringing
@@ -63,9 +68,12 @@ class Task:
                 f"least 10 and at most {_MOST_SAMPLES}. Change the rate."
             )
 
-    def plants(self) -> tuple[AnyPlant, ...]:
-        """The nominal plant, and with its natural frequency varied to both sides."""
-        return frequency_variants(self.plant, self.spec.frequency_spread)
+    def variants(self) -> tuple[tuple[AnyPlant, LoopSetting], ...]:
+        """The nominal plant and loop, and others that the controller has to work with.
+
+        The natural frequency is varied to both sides, and the feedthrough to its ends.
+        """
+        return loop_variants(self.plant, self.setting, self.spec.frequency_spread)
 
     @cached_property
     def step(self) -> float:
@@ -118,24 +126,24 @@ def score(candidates: Sequence[PidGains], task: Task) -> CandidateScores:
     Returns:
         Scores, in the order of the candidates.
     """
-    plants = task.plants()
+    variants = task.variants()
     spec = task.spec
     miss = np.zeros(len(candidates))
     peak = np.zeros(len(candidates))
-    for plant in plants:
-        found = PlantGrid.of(plant, task.setting).margins(candidates)
+    for plant, setting in variants:
+        found = PlantGrid.of(plant, setting).margins(candidates)
         missed = _short(found.phase_margin_deg, spec.phase_margin_deg)
         missed += _short(found.gain_margin_db, spec.gain_margin_db)
         missed += _over(found.peak_sensitivity, spec.peak_sensitivity)
         if spec.keep_crossover:
-            missed += _short(found.crossover_rad_s, plant_crossover(plant, task.setting))
+            missed += _short(found.crossover_rad_s, plant_crossover(plant, setting))
         missed[~found.stable] = _UNSTABLE
         miss, peak = np.maximum(miss, missed), np.maximum(peak, found.peak_sensitivity)
     jump = [gains.jump_gain(task.setting.rate_hz) for gains in candidates]
     miss = miss + _over(np.array(jump), task.noise_gain)
     calm = np.flatnonzero(miss < 0.5 * _UNSTABLE)
     if calm.size:
-        miss[calm] += _step_miss([candidates[index] for index in calm.tolist()], plants, task)
+        miss[calm] += _step_miss([candidates[index] for index in calm.tolist()], variants, task)
     if task.chance is not None:  # evaluated last, and only for loops that meet everything else
         good = miss <= _MET
         kept = [gains for gains, met in zip(candidates, good.tolist(), strict=True) if met]
@@ -162,16 +170,16 @@ def plant_crossover(plant: AnyPlant, setting: LoopSetting) -> float:
 
 
 def _step_miss(
-    candidates: Sequence[PidGains], plants: Sequence[AnyPlant], task: Task
+    candidates: Sequence[PidGains], variants: Sequence[tuple[AnyPlant, LoopSetting]], task: Task
 ) -> NDArray[np.float64]:
     """Relative misses of rise time, overshoot and error in the simulated step."""
     spec, setting = task.spec, task.setting
     reference = np.full(round(task.horizon_s() * setting.rate_hz), task.step)
-    measured, poles = _traces(candidates, plants, reference, setting)
-    measured *= math.copysign(1.0, task.step)
+    strains, poles = _traces(candidates, variants, reference)
+    strains *= math.copysign(1.0, task.step)
     rings = [_lasting(row, setting.rate_hz) for row in poles]
-    numbers = [_step_numbers(y, ring, task) for y, ring in zip(measured, rings, strict=True)]
-    shape = (3, len(plants), len(candidates))
+    numbers = [_step_numbers(y, ring, task) for y, ring in zip(strains, rings, strict=True)]
+    shape = (3, len(variants), len(candidates))
     rise, overshoot, error = np.array(numbers).T.reshape(shape)
     miss = _over(error.max(axis=0), spec.steady_state_error)
     if spec.rise_time_s is not None and spec.rise_time_tolerance is not None:
@@ -186,27 +194,32 @@ def _step_miss(
 
 def _traces(
     candidates: Sequence[PidGains],
-    plants: Sequence[AnyPlant],
+    variants: Sequence[tuple[AnyPlant, LoopSetting]],
     reference: NDArray[np.float64],
-    setting: LoopSetting,
 ) -> tuple[NDArray[np.float64], list[NDArray[np.complex128]]]:
-    """Measurements and poles of every candidate on the first plant, then on the second, ..."""
-    simple = [plant for plant in plants if isinstance(plant, Plant)]
-    if len(simple) < len(plants):
-        general = [plant for plant in plants if not isinstance(plant, Plant)]
-        traces = [trace_general(plant, candidates, reference, setting)[0] for plant in general]
-        poles = [closed_loop_poles(plant, candidates, setting) for plant in general]
-        return np.concatenate(traces), [row for rows in poles for row in rows]
-    all_gains = [gains for _ in simple for gains in candidates]
-    all_plants = [plant for plant in simple for _ in candidates]
-    measured = trace_ensemble(all_plants, all_gains, reference, setting).measured.astype(float)
-    loops = SampledLoops.of(
-        all_plants,
-        all_gains,
-        period_s=1.0 / setting.rate_hz,
-        measurement_delay_s=setting.measurement_delay_s,
-    )
-    return measured, list(loops.poles())
+    """Outputs and poles of every candidate on the first plant, then on the second, ...
+
+    An output is that of the plant, with the delay of the measurement.
+    """
+    outputs, poles = [], []
+    for plant, setting in variants:
+        if isinstance(plant, Plant):
+            plants = [plant] * len(candidates)
+            traces = trace_ensemble(plants, candidates, reference, setting)
+            measured, u = traces.measured.astype(float), traces.u.astype(float)
+            loops = SampledLoops.of(
+                plants,
+                candidates,
+                period_s=1.0 / setting.rate_hz,
+                measurement_delay_s=setting.measurement_delay_s,
+                feedthrough=setting.feedthrough,
+            )
+            poles += list(loops.poles())
+        else:
+            measured, u = trace_general(plant, candidates, reference, setting)
+            poles += list(closed_loop_poles(plant, candidates, setting))
+        outputs.append(plant_output(plant, measured, u, setting))
+    return np.concatenate(outputs), poles
 
 
 def _step_numbers(

@@ -36,8 +36,10 @@ def loop_chart(
     highest = np.pi * setting.rate_hz
     middle = middle_rad_s if np.isfinite(middle_rad_s) and middle_rad_s > 0.0 else 0.05 * highest
     omega = np.geomspace(middle / 100.0, min(100.0 * middle, highest), _POINTS)
-    response = loop_response(plant, gains, omega, loop_delay_s=setting.measurement_delay_s,
-                             rate_hz=setting.rate_hz)  # fmt: skip
+    response = loop_response(
+        plant, gains, omega, loop_delay_s=setting.measurement_delay_s, rate_hz=setting.rate_hz,
+        feedthrough=setting.feedthrough,
+    )  # fmt: skip
     hz, one = omega / (2.0 * np.pi), np.ones(_POINTS)
     axis = "Frequency (Hz)"
     return Chart("Open loop with its delay", (
@@ -71,9 +73,14 @@ def step_chart(
     found = predicted_step(plant, gains, setting, step, 20.0 / max(crossover_rad_s, 1e-3))
     loop = loop_chart(plant, gains, setting, crossover_rad_s)
     controller, output = names or ("Controller", "Output")
+    curves = [Curve(found.time_s, found.measured, "measured by the loop")]
+    if setting.feedthrough:
+        curves.append(
+            Curve(found.time_s, found.output, "output, with the delay of the measurement")
+        )
+    curves.append(Curve(found.time_s, found.reference, "reference"))
     return Chart("Predicted step, and the open loop with its delay", (
-        Panel("Time (s)", output, (Curve(found.time_s, found.measured, "measured by the loop"),
-                                   Curve(found.time_s, found.reference, "reference"))),
+        Panel("Time (s)", output, tuple(curves)),
         Panel("Time (s)", controller, (Curve(found.time_s, found.u, "", "steps"),)),
         *loop.panels,
     ), shared_x=False)  # fmt: skip

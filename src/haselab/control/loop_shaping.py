@@ -18,12 +18,16 @@ from haselab.control.candidates import Task, plant_crossover, score
 from haselab.control.charts import step_chart
 from haselab.control.gains import PidGains
 from haselab.control.plants.general import AnyPlant, PlantScale
-from haselab.control.plants.general_loops import closed_loop_poles, trace_general
+from haselab.control.plants.general_loops import (
+    closed_loop_poles,
+    plant_output,
+    trace_general,
+)
 from haselab.control.plants.modes import SampledLoops
 from haselab.control.reach import integrates
 from haselab.control.simulate import LoopSetting, simulate_loop
 from haselab.control.spec import DesignSpec
-from haselab.control.stability.margins import Margins, margins
+from haselab.control.stability.margins import Margins, loop_margins
 from haselab.control.stability.plausible import PlausibleMargins
 from haselab.control.step_metrics import StepNumbers, step_metrics
 from haselab.models.plant import Plant
@@ -45,6 +49,7 @@ _NAME_WIDTH = 28
 _MEMBERS = 12  # candidates per generation and unknown
 _GENERATIONS = 45
 _MOST_DELAY = 50  # updates; above, a search takes minutes
+_AGAIN, _SMALL_EXCESS = 2, 1e-3  # searches for less overshoot; excess that counts as none
 _DECAYS = 6.0  # time constants after which a response of the size of the step has settled
 _LONGEST_RECORD = 16.0  # of the demanded record, simulated for the settling time
 _MOST_SAMPLES = 250_000  # of such a record
@@ -77,7 +82,8 @@ class Design:
         spec: the specification.
         setting: rate, measurement delay and saturation that it was designed for.
         nominal: prediction for the given plant.
-        spread: predictions over the spread of natural frequency, the nominal one first.
+        spread: predictions over the spread of natural frequency and feedthrough, the nominal one
+            first.
         shortfalls: unmet demands, as text; empty if all are met.
         plant: that it was designed for.
         plausible: margins on plants drawn from the posterior; None without one.
@@ -231,7 +237,7 @@ def predict(
         >>> round(found.step.rise_time_s, 1), found.margins.stable
         (0.7, True)
     """
-    found = margins(plant, gains, loop_delay_s=setting.measurement_delay_s, rate_hz=setting.rate_hz)
+    found = loop_margins(plant, gains, setting)
     if not found.stable:
         nothing = StepNumbers(*[math.nan] * len(dataclasses.fields(StepNumbers)))
         return Prediction(_frequency(plant), found, nothing, math.nan)
@@ -250,7 +256,13 @@ def _slowest_s(plant: AnyPlant, gains: PidGains, setting: LoopSetting) -> float:
     """Longest time constant of the closed loop, in s."""
     period_s, delay_s = 1.0 / setting.rate_hz, setting.measurement_delay_s
     if isinstance(plant, Plant):
-        loops = SampledLoops.of([plant], [gains], period_s=period_s, measurement_delay_s=delay_s)
+        loops = SampledLoops.of(
+            [plant],
+            [gains],
+            period_s=period_s,
+            measurement_delay_s=delay_s,
+            feedthrough=setting.feedthrough,
+        )
         poles = loops.poles()[0]
     else:
         poles = closed_loop_poles(plant, [gains], setting)[0]
@@ -271,7 +283,8 @@ def _simulated(
     if not isinstance(plant, Plant):
         measured, u = trace_general(plant, [gains], reference, setting)
         time_s = np.arange(reference.size) / setting.rate_hz
-        general = step_metrics(time_s, measured[0], reference, reaches=reaches).trials[0]
+        output = plant_output(plant, measured[0], u[0], setting)
+        general = step_metrics(time_s, output, reference, reaches=reaches).trials[0]
         return general, float(np.abs(u).max())
     trace = simulate_loop(plant, gains, reference, setting)
     desired = np.repeat(reference, setting.points_per_sample)
@@ -362,12 +375,31 @@ def design_task(task: Task, rng: np.random.Generator, *, derivative: bool) -> De
         other = _searched(task, rng, _Space(task, derivative, wide=True))
         worse = len(other.shortfalls) >= len(found.shortfalls)
         found = found if worse and found.nominal.margins.stable else other
+    found = _with_peaks(found, task, rng, _Space(task, derivative, wide))
     if not found.nominal.margins.stable:
         raise ResultError(
             f"no stable {'PID' if derivative else 'PI'} loop was found at a delay of "
             f"{task.setting.measurement_delay_s:g} s. Shorten the delay, or check the sign and "
             f"the poles of the plant."
         )
+    return found
+
+
+def _with_peaks(found: Design, task: Task, rng: np.random.Generator, space: _Space) -> Design:
+    """Search again for less overshoot if a search has missed peaks between its samples.
+
+    An output that its loop does not see may ring faster than the loop is.
+    """
+    if not task.setting.feedthrough or task.spec.overshoot is None:
+        return found
+    for _ in range(_AGAIN):
+        worst = max(item.step.overshoot for item in found.spread)
+        over = worst - task.spec.overshoot
+        if not _SMALL_EXCESS < over < task.spec.overshoot:
+            return found
+        lower = dataclasses.replace(task.spec, overshoot=task.spec.overshoot - over)
+        searched = _searched(dataclasses.replace(task, spec=lower), rng, space)
+        found = evaluate_gains(task, searched.gains)
     return found
 
 
@@ -406,8 +438,8 @@ def evaluate_gains(task: Task, gains: PidGains) -> Design:
         The gains with their predictions, as those of a design.
     """
     spread = tuple(
-        predict(plant, gains, task.setting, step=task.step, record_s=task.horizon_s())
-        for plant in task.plants()
+        predict(plant, gains, setting, step=task.step, record_s=task.horizon_s())
+        for plant, setting in task.variants()
     )
     spec = dataclasses.replace(task.spec, step=task.step, noise_gain=task.noise_gain)
     shortfalls = _shortfalls(task, gains, spread)
@@ -508,8 +540,8 @@ def _shortfalls(task: Task, gains: PidGains, spread: tuple[Prediction, ...]) -> 
         within = spec.rise_time_tolerance + 0.01
         if not abs(rise_s / spec.rise_time_s - 1.0) <= within:
             short.append(("rise time in s", rise_s, f"{spec.rise_time_s:g} within {within:.0%}"))
-    for item, plant in zip(spread, task.plants(), strict=True):
-        own = plant_crossover(plant, task.setting)
+    for item, (plant, setting) in zip(spread, task.variants(), strict=True):
+        own = plant_crossover(plant, setting)
         if spec.keep_crossover and not item.margins.crossover_rad_s >= 0.99 * own:
             got = item.margins.crossover_rad_s
             short.append(("crossover in rad/s", got, f"{own:.3g} or more"))

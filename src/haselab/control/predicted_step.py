@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 
 from haselab.control.gains import PidGains
 from haselab.control.plants.general import AnyPlant
-from haselab.control.plants.general_loops import trace_general
+from haselab.control.plants.general_loops import plant_output, trace_general
 from haselab.control.simulate import LoopSetting, simulate_loop
 from haselab.models.plant import Plant
 
@@ -26,12 +26,15 @@ class PredictedStep:
         time_s: since the step, in s. Shape `(N,)`.
         reference: the step.
         measured: what the loop measures, with its delay.
+        output: of the plant, with the delay of the measurement. It differs from `measured` in a
+            loop with feedthrough.
         u: output of the controller.
     """
 
     time_s: Floats
     reference: Floats
     measured: Floats
+    output: Floats
     u: Floats
 
 
@@ -54,6 +57,9 @@ def predicted_step(
     time_s = np.arange(count) / setting.rate_hz
     if isinstance(plant, Plant):
         trace = simulate_loop(plant, gains, reference, setting)
-        return PredictedStep(time_s, reference, trace.measured, trace.u)
-    measured, u = trace_general(plant, [gains], reference, setting)
-    return PredictedStep(time_s, reference, measured[0], u[0])
+        measured, u = trace.measured, trace.u
+    else:
+        traced, driven = trace_general(plant, [gains], reference, setting)
+        measured, u = traced[0], driven[0]
+    output = plant_output(plant, measured, u, setting)
+    return PredictedStep(time_s, reference, measured, output, u)

@@ -11,6 +11,7 @@ from haselab import _loops
 from haselab.base import InputError
 from haselab.control.gains import PidGains, Saturation
 from haselab.control.plants.held import HeldPlants
+from haselab.models.actuator.strain_map import LARGEST_FEEDTHROUGH
 from haselab.models.maps import allow_start
 from haselab.models.plant import Plant
 
@@ -22,7 +23,7 @@ _LONGEST_DELAY = 1e4
 
 @dataclass(frozen=True)
 class LoopSetting:
-    """Settings of a loop besides plant and controller.
+    r"""Settings of a loop besides plant and controller.
 
     Args:
         rate_hz: sampling rate, in Hz.
@@ -33,8 +34,16 @@ class LoopSetting:
         initial_u: constant drive strain before the first sample, at which the plant is in steady
             state.
         points_per_sample: points of the fine trace per sample.
+        feedthrough: fraction $d$ of the steady-state change of the sensed strain that appears
+            together with a step of the drive, before the plant moves. It is 0 for a measured
+            length. Sensing by capacitance has one if the capacitance depends on the voltage as well
+            as on the length, as that of pouches: the loop measures $(1 - d)\,P u + d\,P(0)\,u$ of a
+            plant $P$, both with its delay.
+        feedthrough_range: lowest and highest feedthrough over the loop's strains; None: it is the
+            same for all of them.
     Raises:
-        InputError: a rate, delay or count out of range, or `initial_u` outside the limits.
+        InputError: a rate, delay, feedthrough or count out of range, or `initial_u` outside the
+            limits.
     """
 
     rate_hz: float = 100.0
@@ -42,6 +51,8 @@ class LoopSetting:
     saturation: Saturation = field(default_factory=Saturation)
     initial_u: float = 0.0
     points_per_sample: int = 4
+    feedthrough: float = 0.0
+    feedthrough_range: tuple[float, float] | None = None
 
     def __post_init__(self) -> None:
         low, high = self.saturation.low, self.saturation.high
@@ -55,6 +66,8 @@ class LoopSetting:
              f"0 to {_LONGEST_DELAY:g} sampling periods"),
             ("initial_u", self.initial_u, within, f"[{low:g}, {high:g}]"),
             ("points_per_sample", self.points_per_sample, self.points_per_sample >= 1, "1 or more"),
+            ("feedthrough", self.feedthrough, abs(self.feedthrough) <= LARGEST_FEEDTHROUGH,
+             f"{-LARGEST_FEEDTHROUGH:g} to {LARGEST_FEEDTHROUGH:g}"),
         )  # fmt: skip
         for name, value, good, allowed in checks:
             if not good:
@@ -67,7 +80,7 @@ class LoopTrace:
 
     Args:
         time_s: fine time from the first sample, in s. Shape `(N * points_per_sample,)`.
-        y: plant output in strain, on the fine time.
+        y: plant output in strain, without the feedthrough of the measurement, on the fine time.
         sample_time_s: sampling instants, in s. Shape `(N,)`.
         measured: measurement that the controller used (NaN without a controller). Shape `(N,)`.
         u: output of the controller, held until the next sample. Shape `(N,)`.
@@ -154,7 +167,10 @@ def _run(
     """Controller outputs, and the measurements that they respond to."""
     period_s, u = 1.0 / setting.rate_hz, setting.initial_u
     held = HeldPlants.of(
-        [plant], period_s=period_s, measurement_delay_s=setting.measurement_delay_s
+        [plant],
+        period_s=period_s,
+        measurement_delay_s=setting.measurement_delay_s,
+        feedthrough=setting.feedthrough,
     )
     weight = period_s / (period_s + gains.derivative_filter_s)
     limits = setting.saturation

@@ -17,6 +17,7 @@ __all__ = ["StepMetrics", "StepNumbers", "over_trials", "step_metrics", "step_nu
 _BASELINE_S = 1.0  # the initial level is the mean of the last second before the step
 _FINAL_PART = 0.1  # the final value is the mean of the record's last tenth
 _SETTLED = 0.02
+_SLOW = 2.0  # periods of the ringing: a slower rise is hardly changed by averaging it out
 _RINGS = 0.1  # of the step: such ringing crosses 90 % of it again
 
 
@@ -66,8 +67,8 @@ class StepMetrics:
     fields see `StepNumbers`.
 
     Args:
-        rise_time_s: in s; NaN if it is shorter than the raw one, because averaging out the ringing
-            removed the rise as well.
+        rise_time_s: in s; NaN if it is shorter than a raw one of less than two periods of the
+            ringing, because averaging out the ringing removed the rise as well.
         raw_rise_time_s: in s.
         overshoot: relative to the step.
         ring_averaged_overshoot: relative to the step.
@@ -140,7 +141,7 @@ def step_metrics(
         return over_trials(np.array([getattr(item, name) for item in numbers]), unit)
 
     rise_s, raw_s = over("rise_time_s", "s"), over("raw_rise_time_s", "s")
-    if found is not None and rise_s.value < raw_s.value:
+    if found is not None and rise_s.value < raw_s.value < _SLOW * 2.0 * math.pi / found.omega_rad_s:
         rise_s = Estimate(math.nan, math.nan, (math.nan, math.nan), "s")
     return StepMetrics(
         rise_time_s=rise_s,

@@ -25,6 +25,7 @@ from haselab.actuators import (
     ActuatorLaw,
     LawTable,
     equilibrium_m,
+    feedthrough,
     law_table,
     measured_parameters,
     with_parameters,
@@ -45,6 +46,8 @@ _NEWTON_STEPS = 8  # each doubles the correct digits
 _KEPT_PULL, _MOST_KEPT = 0.075, 0.5
 _BLIND = 5.0  # times less capacitance per length at the lowest drive than at the one that holds
 _USUAL_NOISE = 2e-4  # strain, where it is not known
+# Of the reachable range: steps for slopes, and what is left out at its ends, where the drive is 0.
+_SHARE_STEP, _SHARE_INSIDE = 1e-4, 0.01
 _SENSED_POINTS = 401  # strains among which the end of the sensed range is found
 _BENCH = ("camera.", "sensing.", "start.")  # parameters of a fit that are none of the law
 
@@ -312,6 +315,33 @@ class KnownActuator:
     def capacitance_follows_drive(self) -> bool:
         """Whether the capacitance at one length depends on the voltage, as that of pouches."""
         return len(self.table.pull_n_v2) > 1
+
+    def feedthrough(self, strain: float) -> float:
+        """Feedthrough of the drive to the sensed strain, see `LoopSetting`.
+
+        Args:
+            strain: that is held, within the reachable ones.
+        Returns:
+            What the change of the voltage at constant length contributes to the change of the
+            capacitance, as a fraction of it; 0 for a capacitance that depends on the length alone.
+        Raises:
+            InputError: See `reachable`.
+        """
+        if not self.capacitance_follows_drive:
+            return 0.0
+        low, high = self.reachable()
+        step, inside = _SHARE_STEP * (high - low), _SHARE_INSIDE * (high - low)
+        middle = min(max(strain, low + inside), high - inside)
+        lengths = [self.length_m(middle + side * step) for side in (-1.0, 1.0)]
+        volts = [
+            self.gain_v_per_v * self.static_drive_v(middle + side * step) for side in (-1.0, 1.0)
+        ]
+        return feedthrough(
+            self.law,
+            0.5 * sum(lengths),
+            0.5 * sum(volts),
+            (lengths[1] - lengths[0]) / (volts[1] - volts[0]),
+        )
 
     @cached_property
     def slack_f(self) -> float:

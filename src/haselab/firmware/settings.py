@@ -218,8 +218,8 @@ class ChipSettings:
                 )
         if not self.strain_low < self.strain_high:
             raise InputError(
-                f"The strains that the microcontroller's output reaches are {self.strain_low:g} to "
-                f"{self.strain_high:g} within the controller's limits, which is no range. Give "
+                "The strains that the microcontroller's output reaches within the controller's "
+                f"limits are {self.strain_low:g} to {self.strain_high:g}: no range is left. Give "
                 "other --limits to 'haselab design'."
             )
         if not 0.0 < self.drive_high_v < _OUTPUT_V:

@@ -99,7 +99,7 @@ def note_range(
         return found
     note = (
         f"The input goes from {low:.4g} to {high:.4g}, but the model was fitted to inputs from "
-        f"{fitted[0]:.4g} to {fitted[1]:.4g}: an error can come from the wider range alone"
+        f"{fitted[0]:.4g} to {fitted[1]:.4g}: the prediction may be wrong for this reason alone"
     )
     return replace(found, notes=(*found.notes, note))
 

@@ -396,8 +396,8 @@ class LiveBench:
         if abs(self._reference - strain) <= slack:
             return {}
         note = (
-            f"By the voltage map, a drive of {drive.low:g} to {drive.high:g} V reaches no strain "
-            f"of {100.0 * strain:.6g} %. The desired strain was limited to "
+            f"A drive of {drive.low:g} to {drive.high:g} V does not reach a strain of "
+            f"{100.0 * strain:.6g} %. The desired strain was limited to "
             f"{100.0 * self._reference:.6g} %."
         )
         return {"note": note}

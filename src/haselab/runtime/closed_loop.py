@@ -214,6 +214,13 @@ def _resonance_rad_s(loop: LoopSettings) -> float:
     return MotionModel(known).natural_rad_s(min(ends_m), max(ends_m))
 
 
+def _follows_drive(loop: LoopSettings) -> bool:
+    """Whether the sensed strain follows the drive at once, as far as it is known."""
+    if loop.actuator is not None:
+        return loop.actuator.capacitance_follows_drive
+    return loop.strain_map.feedthrough > 0.0
+
+
 def _watchdog(rig: GuardedRig, carrier: tuple[float, float], loop: LoopSettings) -> LoopWatchdog:
     settings, by_video = rig.safety.settings, loop.video_zero_px is not None
     range_f = loop.strain_map.range_f or (0.0, 0.0)
@@ -231,7 +238,7 @@ def _watchdog(rig: GuardedRig, carrier: tuple[float, float], loop: LoopSettings)
         loop.controller.kind.alternates,
         _resonance_rad_s(loop),
         0.0 if loop.actuator is None else loop.actuator.slack_f,
-        loop.actuator is not None and loop.actuator.capacitance_follows_drive and not by_video,
+        _follows_drive(loop) and not by_video,
     )
     return LoopWatchdog(
         model, settings.loop, settings.rating, rig.present_drive_v, rig.bench.is_settled

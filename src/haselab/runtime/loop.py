@@ -83,15 +83,20 @@ class LoopSettings:
     def within(self, low_v: float, high_v: float) -> LoopSettings:
         """Narrow the saturation to the strains whose voltage is within limits.
 
+        The voltage is that of the voltage map; for a controller that puts out a voltage, it is that
+        of the physical model, if there is one.
+
         Args:
             low_v: lowest voltage of the drive, in V.
             high_v: highest one.
         Returns:
             The narrowed settings.
         Raises:
-            LimitError: By the voltage map, no range of strains is within these limits.
+            LimitError: No range of strains is within these limits.
         """
         ends = self.saturation.low, self.saturation.high
+        if self.controller.kind.output == "voltage":
+            return self._within_reach(low_v, high_v)
         found = self.voltage_map.reach(ends, low_v, high_v)
         if found is None or not found[0] < found[1]:
             volts = self.voltage_map.voltage_v(ends)
@@ -100,6 +105,23 @@ class LoopSettings:
                 f"{100.0 * ends[1]:.6g} %) need {volts.min():.4g} to {volts.max():.4g} V, but the "
                 f"drive is limited to {low_v:g} to {high_v:g} V. Change the limit of the drive, or "
                 "the limits of the controller."
+            )
+        return replace(self, saturation=Saturation(*found))
+
+    def _within_reach(self, low_v: float, high_v: float) -> LoopSettings:
+        """Narrow the saturation to what the actuator reaches by its physical model."""
+        known, limits = self.actuator, self.saturation
+        if known is None:
+            return self
+        ends_v = max(known.low_v, low_v), min(known.high_v, high_v)
+        low, high = replace(known, low_v=ends_v[0], high_v=ends_v[1]).reachable()
+        found = max(limits.low, low), min(limits.high, high)
+        if not found[0] < found[1]:
+            raise LimitError(
+                f"By the physical model, a drive of {ends_v[0]:g} to {ends_v[1]:g} V reaches "
+                f"{100.0 * low:.6g} to {100.0 * high:.6g} %, but the limits of the controller are "
+                f"{100.0 * limits.low:.6g} to {100.0 * limits.high:.6g} %. Change the limit of the "
+                "drive, or the limits of the controller."
             )
         return replace(self, saturation=Saturation(*found))
 

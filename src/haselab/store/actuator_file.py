@@ -225,7 +225,7 @@ def _sole_writer(path: Path) -> Iterator[None]:
         while not _locked(path, held):
             if time.monotonic() > end_s:
                 raise InputError(
-                    f"Not written: for {_WAIT_S:g} s, another program has written this file. End "
+                    f"Not written: another program has locked this file for {_WAIT_S:g} s. End "
                     f"that program, then write again. {path}"
                 )
             time.sleep(_POLL_S)

@@ -3,11 +3,12 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import asdict
+from dataclasses import asdict, replace
 from pathlib import Path
 from typing import Any
 
 from haselab.base import JsonObject, table_at
+from haselab.models.actuator.strain_map import StrainMap
 from haselab.models.actuator.tables import strain_map_section, voltage_map_section
 from haselab.models.maps import VoltageMap
 from haselab.rig.protocols import PLANAR_HASEL
@@ -232,7 +233,7 @@ def write_design(
     if maps is not None:
         sections |= {
             "actuator.geometry": {"zero_length_m": maps.length_m},
-            "sensing.strain_map": strain_map_section(maps.strain_map),
+            "sensing.strain_map": strain_map_section(_strain_map(maps, dynamics)),
             "drive.voltage_map": voltage_map_section(maps.voltage_map),
         }
     if dynamics is not None:
@@ -246,6 +247,14 @@ def write_design(
     if not path.exists():
         sections = {"actuator": {"name": study.name, "kind": kind}, **sections}
     write_sections(path, sections, _START)
+
+
+def _strain_map(maps: Maps, dynamics: Dynamics | None) -> StrainMap:
+    """The map from capacitance to strain, with the feedthrough that the chirp determines."""
+    found = None if dynamics is None else dynamics.significant_feedthrough
+    if found is None:
+        return maps.strain_map
+    return replace(maps.strain_map, feedthrough=found.value, feedthrough_std=found.std)
 
 
 def sections_found(found: Findings) -> list[str]:

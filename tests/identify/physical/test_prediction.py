@@ -228,6 +228,6 @@ def test_an_uncertain_zero_does_not_hide_a_wrong_shape():
     assert right.status == "ok" and shifted.status == "ok"
     assert right.together(LENGTH).std.min() > 5e-5
     assert not any(part.is_outside for part in wrong.all_parts)
-    assert wrong.status.startswith("model error: without a constant, only ")
+    assert wrong.status.startswith("model error: without a common offset, only ")
     # a moved camera is another constant
     assert predict_motion(uncertain, moved, free_offset=True).status == "ok"

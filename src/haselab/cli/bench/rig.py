@@ -488,7 +488,7 @@ def _safe_by_its_program(key: str, what: str = "program") -> tuple[str, str]:
 def status(as_json: bool, out: Path | None) -> None:
     """Show which benches of this computer are armed.
 
-    For the others it shows why they were made safe. Armed benches are first, then those
+    For the others it shows why they tripped. Armed benches are first, then those
     that were used last. It reads what programs have recorded since the computer started. It does
     not contact any instrument: this is NOT a measurement of a voltage.
     """

@@ -67,8 +67,8 @@ _TABLE_CLOCK = 1e-3  # relative standard deviation of their times: 30 frames/s a
 @shared_option("--zero-length-m", type=POSITIVE,
                detail="Used for tables with strains only. Default: that of A.toml.")  # fmt: skip
 @click.option("--added-inertia-kg", type=POSITIVE,
-              help="State where the search for the inertia without weight begins, such as that of "
-              "a lever, in kg. Default: 5 % of the hung mass.")  # fmt: skip
+              help="Set the starting value of the added inertia in kg: of what moves but does not "
+              "load the actuator, such as a lever. Default: 5 % of the hung mass.")  # fmt: skip
 @click.option("--zero-std-m", type=POSITIVE,
               help="Set the standard deviation of the zero of the lengths in m. Default: 5e-5 with "
               "tables, 2e-6 without.")  # fmt: skip

@@ -29,6 +29,7 @@ from haselab.store.session.reader import SessionReader, session_file
 __all__ = ["Pairs", "read_pairs", "save_strain_map", "save_voltage_map"]
 
 _LEAST_ROWS = 32
+_KEPT = ("feedthrough", "feedthrough_std")  # a new map does not determine them
 _FEW = 0.05  # share of the samples, and of the strains, that a limited map may leave out unnoticed
 
 Floats = NDArray[np.float64]
@@ -197,8 +198,8 @@ def save_strain_map(actuator: Path, pairs: Pairs, files: Sequence[Path]) -> Mapp
         beyond = float(np.mean(~inside))
         few = beyond < _FEW and np.ptp(e[inside]) > (1.0 - _FEW) * np.ptp(e)
         why = (
-            f"the {100.0 * beyond:.2g} % of the samples beyond have about the same strains, as by "
-            "noise of the capacitance or a strain that stays at its end"
+            f"in the {100.0 * beyond:.2g} % of the samples outside, the strain hardly changes: "
+            "noise of the capacitance, or a strain that has reached its end"
             if few
             else "no line, parabola or cubic follows the strain over the whole record, which "
             "hardly changes with the capacitance there, or turns"
@@ -209,8 +210,8 @@ def save_strain_map(actuator: Path, pairs: Pairs, files: Sequence[Path]) -> Mapp
             err=True,
         )
     section = strain_map_section(found)
-    fields = StrainMap.__dataclass_fields__
-    save_section(actuator, "sensing.strain_map", section, files, list(fields))
+    fields = [name for name in StrainMap.__dataclass_fields__ if name not in _KEPT]
+    save_section(actuator, "sensing.strain_map", section, files, fields)
     return section
 
 

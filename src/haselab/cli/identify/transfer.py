@@ -249,8 +249,8 @@ def _warn_of_gain(fit: TransferFit, output: str, unit: str) -> None:
     gain = PlantScale.of(fit.plant).gain
     if unit in ("", "1") and not 1.0 / _FAR_GAIN <= abs(gain) <= _FAR_GAIN:
         click.echo(
-            f"haselab: warning: the static gain is {gain:.3g}, but about 1 for a model from strain "
-            f"(by the voltage map) to strain. Is column {output} a strain of the same actuator? If "
+            f"haselab: warning: the static gain is {gain:.3g}; a model from strain (by the voltage "
+            f"map) to strain has about 1. Is column {output} a strain of the same actuator? If "
             f"it is a displacement, state its unit: --unit '{output}=m', or mm.",
             err=True,
         )

@@ -21,13 +21,15 @@ from haselab.control import (
     Design,
     DesignSpec,
     LoopSetting,
+    Saturation,
     design_controller,
-    margins,
 )
 from haselab.control.charts import loop_chart
+from haselab.control.feedthrough import feedthrough_doubt, with_feedthrough
 from haselab.control.gains import gain_units
 from haselab.control.plants.general import AnyPlant
 from haselab.control.plausible_design import USUAL_STRUCTURE
+from haselab.control.stability.margins import loop_margins
 from haselab.controllers import (
     CONTROLLERS,
     ControllerKind,
@@ -48,6 +50,7 @@ from haselab.pipelines.design.model_file import (
     read_loop,
     read_origin,
     read_posterior,
+    read_tables,
 )
 from haselab.pipelines.design.sections import (
     CONTROLLER_KEYS,
@@ -116,7 +119,8 @@ def command(
 
     MODEL is a model.json or an actuator file. The command reads [model], [drive] and the demands of
     an actuator file and writes its [controller], but leaves the file unchanged if --out is given.
-    The margins include the delay of the loop. If the model has a covariance, plausible plants are
+    The margins include the delay of the loop and the feedthrough of the sensed strain. If the model
+    has a covariance, plausible plants are
     drawn from it, and the share of them that keeps the margins is reported.
     """
     warn_misspelled_in(model)
@@ -140,7 +144,7 @@ def command(
     limits = limits_of(model, loop["limits"])
     if note := default_limits_note(model, loop["limits"], limits):
         click.echo(f"haselab: {note}", err=True)
-    setting = LoopSetting(rate_hz, delay_s, limits)
+    setting = _setting(model, rate_hz, delay_s, limits)
     if posterior is None and loop["probability"] is not None:
         raise InputError(
             f"--probability {loop['probability']:g} needs the covariance of the model, which the "
@@ -221,8 +225,8 @@ def _own_design(
         if strains != (low, high):
             click.echo(
                 f"haselab: The limits are strains of {strains[0]:.3g} to {strains[1]:.3g} instead "
-                f"of {low:.3g} to {high:.3g}, which the drive reaches: beyond, the drive is near "
-                "0 V, where the pouches are slack and the capacitance hardly depends on the "
+                f"of {low:.3g} to {high:.3g}, which the drive reaches: for the rest, the drive is "
+                "near 0 V, where the pouches are slack and the capacitance hardly depends on the "
                 f"length. {model}",
                 err=True,
             )
@@ -286,9 +290,9 @@ def _judge(
     if note := default_note(model, kind):
         click.echo(f"haselab: {note}", err=True)
     rate_hz, delay_s = loop_of(model, loop["rate_hz"], loop["delay_s"])
-    setting = LoopSetting(rate_hz, delay_s, limits_of(model, loop["limits"]))
+    setting = _setting(model, rate_hz, delay_s, limits_of(model, loop["limits"]))
     plant, feedback = read_any_plant(model), feedback_of(held, rate_hz)
-    found = margins(plant, feedback, loop_delay_s=delay_s, rate_hz=rate_hz)
+    found = loop_margins(plant, feedback, setting)
     if not found.stable:
         raise ResultError(
             f"The loop with the controller {kind!r} is unstable with a delay of {delay_s:g} s. "
@@ -307,6 +311,18 @@ def _judge(
     _save(model, out, section, None)
     emit(answer | {"parameters": held.parameters, "searched": False}, as_json=as_json, out=None)
     save_plot(plot, lambda: loop_chart(plant, feedback, setting, found.crossover_rad_s))
+
+
+def _setting(model: Path, rate_hz: float, delay_s: float, limits: Saturation) -> LoopSetting:
+    """The loop of a model; that of an actuator file with its feedthrough."""
+    setting = LoopSetting(rate_hz, delay_s, limits)
+    if model.suffix.lower() != ".toml":
+        return setting
+    tables = read_tables(model)
+    found = with_feedthrough(setting, tables)
+    if doubt := feedthrough_doubt(found, tables):
+        click.echo(f"haselab: warning: {doubt}: {model}", err=True)
+    return found
 
 
 def _save(model: Path, out: Path | None, section: dict[str, object], spec: Path | None) -> None:

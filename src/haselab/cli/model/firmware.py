@@ -381,7 +381,9 @@ def _metrics(
     loop: LoopRun, name: str, case: StepCase | None, plant: Plant, plan: StepPlan
 ) -> JsonObject:
     try:
-        return loop_row(loop, None if case is None else case.gains, plant)
+        if case is None:
+            return loop_row(loop, None, plant)
+        return loop_row(loop, case.gains, plant, case.loop.feedthrough)
     except InputError:
         raise InputError(
             f"After the step from {plan.before:g} to {plan.after:g}, the strain ({name}) does not "

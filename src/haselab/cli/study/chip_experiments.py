@@ -19,7 +19,8 @@ from typing import IO, Any
 
 from haselab.base import HaselabError, to_plain
 from haselab.cli.study.chip_run import record_on_chip
-from haselab.control import PidGains
+from haselab.control import LoopSetting, PidGains
+from haselab.control.feedthrough import with_feedthrough
 from haselab.firmware import FrontEnd
 from haselab.rig.chip import ChipFile, SupplyModel, read_design
 from haselab.rig.rig_file import load_rig
@@ -218,7 +219,9 @@ def _desktops(file: ChipFile, place: Path, steps: StepStudy) -> dict[str, Any]:
     gains = None
     if settings.own is None:
         gains = PidGains(settings.kp, settings.ki, settings.kd, settings.derivative_filter_s)
-    section = section_of(runs, [loop_row(run, gains, found.plant) for run in runs])
+    feedthrough = with_feedthrough(LoopSetting(), found.tables).feedthrough
+    rows = [loop_row(run, gains, found.plant, feedthrough) for run in runs]
+    section = section_of(runs, rows)
     return {"loops": section["loops"], "metrics": section["metrics"]}
 
 

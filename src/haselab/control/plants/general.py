@@ -10,6 +10,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 from scipy.linalg import expm
 
+from haselab.base import InputError
 from haselab.control.gains import PidGains
 from haselab.control.linear import LinearController
 from haselab.control.plants.modes import Modes
@@ -21,8 +22,10 @@ __all__ = [
     "HeldModel",
     "PlantScale",
     "corners_of",
+    "delay_in_updates",
     "frequency_variants",
     "sampled_response_of",
+    "static_gain",
 ]
 
 Floats = NDArray[np.float64]
@@ -54,19 +57,32 @@ class HeldModel:
     samples: int
 
     @classmethod
-    def of(cls, model: RationalModel, *, period_s: float, measurement_delay_s: float) -> HeldModel:
-        """Discretise a model.
+    def of(
+        cls,
+        model: RationalModel,
+        *,
+        period_s: float,
+        measurement_delay_s: float,
+        feedthrough: float = 0.0,
+    ) -> HeldModel:
+        """Discretise a model, to the output that a loop measures; see `LoopSetting.feedthrough`.
 
+        Raises:
+            InputError: a feedthrough, but the model integrates.
         Source: variation of constants in controllable form, with time scaled by the poles'
             magnitude.
         """
         a, b, c, d, omega = _scaled_states(model)
         delay_s = model.delay_s + measurement_delay_s
-        samples = math.floor(delay_s / period_s + _WHOLE) + 1
+        samples = delay_in_updates(delay_s, period_s)
         lead_s = min(samples * period_s - delay_s, period_s)
         step, push = _held(a, b, omega * period_s)
         lead, lead_push = _held(a, b, omega * lead_s)
-        return cls(step, push, c @ lead, float(c @ lead_push) + d, samples)
+        kept = 1.0 - feedthrough
+        feed = kept * (float(c @ lead_push) + d)
+        if feedthrough:
+            feed += feedthrough * static_gain(model)
+        return cls(step, push, kept * (c @ lead), feed, samples)
 
     def response(self, omega_rad_s: ArrayLike, period_s: float) -> Complexes:
         """Response from held input to sampled output, in (0, pi / period_s]. Shape `(...)`."""
@@ -78,6 +94,26 @@ class HeldModel:
         right = np.broadcast_to(self.push[:, None], (*z.shape, size, 1))
         states = np.linalg.solve(shifted, right)[..., 0]
         return np.asarray(z**-self.samples * (states @ self.read + self.feed))
+
+
+def static_gain(plant: AnyPlant) -> float:
+    """Static gain, for the feedthrough of a measurement.
+
+    Args:
+        plant: plant.
+    Returns:
+        The gain.
+    Raises:
+        InputError: the plant integrates.
+    """
+    if isinstance(plant, Plant):
+        return plant.static_gain
+    if plant.denominator[-1] == 0.0:
+        raise InputError(
+            "The feedthrough of the sensed strain needs a finite static gain, but the model "
+            "integrates. Set feedthrough = 0 in [sensing.strain_map]."
+        )
+    return plant.numerator[-1] / plant.denominator[-1]
 
 
 def _scaled_states(model: RationalModel) -> tuple[Floats, Floats, Floats, float, float]:
@@ -172,23 +208,50 @@ def frequency_variants(plant: AnyPlant, spread: float) -> tuple[AnyPlant, ...]:
 
 
 def sampled_response_of(
-    plant: AnyPlant, omega_rad_s: ArrayLike, rate_hz: float, delay_s: float
+    plant: AnyPlant,
+    omega_rad_s: ArrayLike,
+    rate_hz: float,
+    delay_s: float,
+    feedthrough: float = 0.0,
 ) -> Complexes:
     """Sampled frequency response with hold, delayed by `delay_s` plus the plant's own delay.
 
-    It is not finite at an undamped pole.
+    It is that of the output that a loop measures, see `LoopSetting.feedthrough`. It is not finite
+    at an undamped pole.
     """
     if isinstance(plant, Plant):
         modes = Modes.of(plant)
         with np.errstate(divide="ignore", invalid="ignore"):
-            return modes.sampled_response(omega_rad_s, rate_hz, delay_s + plant.delay_s)
-    return _held_model(plant, 1.0 / rate_hz, delay_s).response(omega_rad_s, 1.0 / rate_hz)
+            moved = modes.sampled_response(omega_rad_s, rate_hz, delay_s + plant.delay_s)
+        if feedthrough == 0.0:
+            return moved
+        late = delay_in_updates(plant.delay_s + delay_s, 1.0 / rate_hz)
+        turned = np.exp(-1j * np.asarray(omega_rad_s, dtype=float) * (late / rate_hz))
+        return np.asarray((1.0 - feedthrough) * moved + feedthrough * plant.static_gain * turned)
+    held = _held_model(plant, 1.0 / rate_hz, delay_s, feedthrough)
+    return held.response(omega_rad_s, 1.0 / rate_hz)
+
+
+def delay_in_updates(delay_s: float, period_s: float) -> int:
+    """Updates from an output until a measurement that contains it.
+
+    Args:
+        delay_s: of plant and measurement, in s.
+        period_s: of the loop, in s.
+    Returns:
+        Number of updates, 1 or more.
+    """
+    return math.floor(delay_s / period_s + _WHOLE) + 1
 
 
 @lru_cache(maxsize=64)
-def _held_model(model: RationalModel, period_s: float, delay_s: float) -> HeldModel:
+def _held_model(
+    model: RationalModel, period_s: float, delay_s: float, feedthrough: float
+) -> HeldModel:
     """The samples of a model; the response of one loop is evaluated dozens of times."""
-    return HeldModel.of(model, period_s=period_s, measurement_delay_s=delay_s)
+    return HeldModel.of(
+        model, period_s=period_s, measurement_delay_s=delay_s, feedthrough=feedthrough
+    )
 
 
 def corners_of(plant: AnyPlant, gains: PidGains | LinearController | None = None) -> Complexes:

@@ -3,16 +3,23 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import replace
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from haselab.control.gains import PidGains
-from haselab.control.plants.general import HeldModel
+from haselab.control.plants.general import (
+    AnyPlant,
+    HeldModel,
+    delay_in_updates,
+    frequency_variants,
+    static_gain,
+)
 from haselab.control.simulate import LoopSetting
 from haselab.models.rational import RationalModel
 
-__all__ = ["closed_loop_poles", "trace_general"]
+__all__ = ["closed_loop_poles", "loop_variants", "plant_output", "trace_general"]
 
 Floats = NDArray[np.float64]
 
@@ -21,6 +28,55 @@ def _law(gains: Sequence[PidGains], period_s: float) -> tuple[Floats, Floats, Fl
     """Proportional, integral and derivative gains per sample, and the filter's weight; `(C,)`."""
     kp, ki, kd, tau = np.array([(g.kp, g.ki, g.kd, g.derivative_filter_s) for g in gains]).T
     return kp, ki * period_s, kd / period_s, period_s / (period_s + tau)
+
+
+def loop_variants(
+    plant: AnyPlant, setting: LoopSetting, spread: float
+) -> tuple[tuple[AnyPlant, LoopSetting], ...]:
+    """A plant with its loop, and the variants that a controller has to work with.
+
+    Args:
+        plant: nominal plant.
+        setting: its loop.
+        spread: change of the frequencies to either side, relative to them.
+    Returns:
+        The nominal plant and loop, then other frequencies, then the ends of the feedthrough.
+    """
+    ends = {end for end in setting.feedthrough_range or () if end != setting.feedthrough}
+    return (
+        *((one, setting) for one in frequency_variants(plant, spread)),
+        *((plant, replace(setting, feedthrough=end)) for end in sorted(ends)),
+    )
+
+
+def plant_output(plant: AnyPlant, measured: Floats, u: Floats, setting: LoopSetting) -> Floats:
+    """The plant's output, with the delay of the measurement, from what a simulated loop measured.
+
+    Args:
+        plant: plant.
+        measured: measurements of the loop, which starts at rest at 0. Shape `(..., N)`.
+        u: outputs of its controller. Shape `(..., N)`.
+        setting: of the loop.
+    Returns:
+        The measurements without the feedthrough. Shape `(..., N)`.
+    """
+    if setting.feedthrough == 0.0:
+        return measured
+    late = delay_in_updates(plant.delay_s + setting.measurement_delay_s, 1.0 / setting.rate_hz)
+    direct = np.zeros_like(measured)
+    direct[..., late:] = (
+        setting.feedthrough * static_gain(plant) * u[..., : measured.shape[-1] - late]
+    )
+    return np.asarray((measured - direct) / (1.0 - setting.feedthrough))
+
+
+def _held(model: RationalModel, setting: LoopSetting) -> HeldModel:
+    return HeldModel.of(
+        model,
+        period_s=1.0 / setting.rate_hz,
+        measurement_delay_s=setting.measurement_delay_s,
+        feedthrough=setting.feedthrough,
+    )
 
 
 def trace_general(
@@ -39,7 +95,7 @@ def trace_general(
         Measurements and controller outputs. Shape `(C, N)` each.
     """
     period_s = 1.0 / setting.rate_hz
-    held = HeldModel.of(model, period_s=period_s, measurement_delay_s=setting.measurement_delay_s)
+    held = _held(model, setting)
     kp, ki, kd, weight = _law(gains, period_s)
     low, high = setting.saturation.low, setting.saturation.high
     desired = np.asarray(reference, dtype=float)
@@ -69,7 +125,7 @@ def closed_loop_poles(
 ) -> NDArray[np.complex128]:
     """Poles of the loops in the z-plane, without saturation. Shape `(C, states)`."""
     period_s = 1.0 / setting.rate_hz
-    held = HeldModel.of(model, period_s=period_s, measurement_delay_s=setting.measurement_delay_s)
+    held = _held(model, setting)
     n, late = held.push.size, held.samples
     size = n + late + 2  # plant, delayed outputs, integrator, filter
     rows = []

@@ -45,9 +45,16 @@ class HeldPlants:
 
     @classmethod
     def of(
-        cls, plants: Sequence[Plant], *, period_s: float, measurement_delay_s: float
+        cls,
+        plants: Sequence[Plant],
+        *,
+        period_s: float,
+        measurement_delay_s: float,
+        feedthrough: float = 0.0,
     ) -> HeldPlants:
         """Discretise `plants`, with as many slow branches as the largest number among them.
+
+        The output is what a loop measures, see `LoopSetting.feedthrough`.
 
         Source: variation of constants; $e^{Mt} = e^{-\\zeta\\omega_n t}(\\cosh x\\, I
         + \\sinh x\\, N/\\sqrt{\\zeta^2 - 1})$ with $N^2 = (\\zeta^2 - 1) I$ (Cayley-Hamilton).
@@ -59,6 +66,8 @@ class HeldPlants:
         samples = np.floor((delay_s + measurement_delay_s) / period_s + 1e-9) + 1.0
         lead_s = np.minimum(samples * period_s - delay_s - measurement_delay_s, period_s)
         step, lead = _free(omega, zeta, np.full(omega.size, period_s)), _free(omega, zeta, lead_s)
+        static_gain = gain + slow_gain.sum(axis=1)
+        gain, slow_gain = (1.0 - feedthrough) * gain, (1.0 - feedthrough) * slow_gain
         push = gain[:, None] * (np.array([1.0, 0.0]) - step[:, :, 0])
         rest = gain[:, None] * lead[:, :, 0]
         slow_left = np.exp(-lead_s[:, None] / tau)
@@ -67,11 +76,12 @@ class HeldPlants:
             free=step.reshape(-1, 4),
             push=np.einsum("bij,bj->bi", lead, push),
             feed=gain * (1.0 - lead[:, 0, 0])
-            - (slow_gain * np.expm1(-lead_s[:, None] / tau)).sum(1),
+            - (slow_gain * np.expm1(-lead_s[:, None] / tau)).sum(1)
+            + feedthrough * static_gain,
             slow_decay=np.exp(-period_s / tau) * (slow_gain != 0.0),
             slow_push=-slow_rest * np.expm1(-period_s / tau),
             rest=np.concatenate([rest, slow_rest], axis=1),
-            static_gain=gain + slow_gain.sum(axis=1),
+            static_gain=static_gain,
             samples=samples.astype(np.int64),
         )
 

@@ -132,7 +132,10 @@ class LoopTable:
             )
         period_s = 1.0 / setting.rate_hz
         held = HeldPlants.of(
-            plants, period_s=period_s, measurement_delay_s=setting.measurement_delay_s
+            plants,
+            period_s=period_s,
+            measurement_delay_s=setting.measurement_delay_s,
+            feedthrough=setting.feedthrough,
         )
         if held.samples.max() >= _LONGEST_DELAY:
             raise InputError(

@@ -102,11 +102,17 @@ class SampledLoops:
         *,
         period_s: float,
         measurement_delay_s: float,
+        feedthrough: float = 0.0,
     ) -> SampledLoops:
         """Compute the coefficients from one plant and one controller per loop."""
         kp, ki, kd, tau = np.array([(g.kp, g.ki, g.kd, g.derivative_filter_s) for g in gains]).T
         return cls(
-            plant=HeldPlants.of(plants, period_s=period_s, measurement_delay_s=measurement_delay_s),
+            plant=HeldPlants.of(
+                plants,
+                period_s=period_s,
+                measurement_delay_s=measurement_delay_s,
+                feedthrough=feedthrough,
+            ),
             kp=kp,
             ki=ki * period_s,
             kd=kd / period_s,

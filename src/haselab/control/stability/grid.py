@@ -65,7 +65,9 @@ class PlantGrid:
     def of(cls, plant: AnyPlant, setting: LoopSetting, points: int = 450) -> PlantGrid:
         """Create the grid of a plant; a third of `points` is added near the resonance."""
         omega = frequency_grid(plant, _TYPICAL, setting.rate_hz, points)
-        sampled = sampled_response_of(plant, omega, setting.rate_hz, setting.measurement_delay_s)
+        sampled = sampled_response_of(
+            plant, omega, setting.rate_hz, setting.measurement_delay_s, setting.feedthrough
+        )
         keep = np.isfinite(sampled)
         return cls(plant, setting.rate_hz, omega[keep], sampled[keep])
 

@@ -14,10 +14,11 @@ from haselab.base import LimitError
 from haselab.control.gains import PidGains
 from haselab.control.linear import LinearController
 from haselab.control.plants.general import AnyPlant, corners_of, sampled_response_of
+from haselab.control.simulate import LoopSetting
 from haselab.control.stability.encirclement import unstable_poles
 from haselab.models.rational import RationalModel
 
-__all__ = ["Crossover", "Margins", "frequency_grid", "loop_response", "margins"]
+__all__ = ["Crossover", "Margins", "frequency_grid", "loop_margins", "loop_response", "margins"]
 _LEAST_DAMPING = 1e-6  # for the width of the grid near a resonance
 _MOST_TURNS = 20_000
 _MOST_STEPS = 100  # iterations for one root
@@ -79,6 +80,7 @@ def loop_response(
     *,
     loop_delay_s: float,
     rate_hz: float | None,
+    feedthrough: float = 0.0,
 ) -> NDArray[np.complex128]:
     """Open-loop response: controller, plant, delay and, for a sampled loop, the hold.
 
@@ -88,10 +90,11 @@ def loop_response(
         omega_rad_s: angular frequencies, in rad/s. Shape `(...)`.
         loop_delay_s: delay besides the plant's and the hold's, in s.
         rate_hz: sampling rate of the loop, in Hz; None for a continuous loop.
+        feedthrough: of the measurement, see `LoopSetting`.
     Returns:
         Complex response of the same shape.
     Raises:
-        LimitError: `rate_hz` is None and the controller exists only sampled.
+        LimitError: `rate_hz` is None, and the controller or the feedthrough exists only sampled.
     Example:
         >>> from haselab.models import Plant
         >>> plant, gains = Plant(1.0, 20.0, 0.5), PidGains(0.0, 2.0)
@@ -103,9 +106,13 @@ def loop_response(
     if rate_hz is None:
         if isinstance(gains, LinearController):
             raise LimitError("rate_hz is None, but this controller is sampled. Give its rate_hz.")
+        if feedthrough:
+            raise LimitError(
+                "rate_hz is None, but a feedthrough needs a sampled loop. Give its rate_hz."
+            )
         delay = np.exp(-1j * omega * loop_delay_s)
         return np.asarray(gains.frequency_response(omega) * plant.frequency_response(omega) * delay)
-    sampled = sampled_response_of(plant, omega, rate_hz, loop_delay_s)
+    sampled = sampled_response_of(plant, omega, rate_hz, loop_delay_s, feedthrough)
     return np.asarray(gains.sampled_response(omega, rate_hz) * sampled)
 
 
@@ -168,6 +175,7 @@ def margins(
     *,
     loop_delay_s: float,
     rate_hz: float | None,
+    feedthrough: float = 0.0,
 ) -> Margins:
     """Compute the margins of a loop from its exact response, without approximating the delay.
 
@@ -182,6 +190,7 @@ def margins(
         loop_delay_s: delay besides the plant's and the hold's, in s.
         rate_hz: sampling rate, in Hz: plant behind a zero-order hold, controller sampled as in
             the C core; None for a continuous loop.
+        feedthrough: of the measurement, see `LoopSetting`.
     Returns:
         The margins.
     Raises:
@@ -200,7 +209,14 @@ def margins(
         raise LimitError(f"rate = {rate_hz:g} Hz; it must be above 0 Hz, or none.")
 
     def response(omega: ArrayLike) -> NDArray[np.complex128]:
-        return loop_response(plant, gains, omega, loop_delay_s=loop_delay_s, rate_hz=rate_hz)
+        return loop_response(
+            plant,
+            gains,
+            omega,
+            loop_delay_s=loop_delay_s,
+            rate_hz=rate_hz,
+            feedthrough=feedthrough,
+        )
 
     omega = _with_delay(frequency_grid(plant, gains, rate_hz, 6000), plant.delay_s + loop_delay_s)
     loop = response(omega)
@@ -227,6 +243,27 @@ def margins(
         peak_sensitivity=peak,
         peak_sensitivity_rad_s=peak_at,
         crossovers=crossovers,
+    )
+
+
+def loop_margins(
+    plant: AnyPlant, gains: PidGains | LinearController, setting: LoopSetting
+) -> Margins:
+    """Compute the margins of a loop at its rate, with its delay and feedthrough.
+
+    Args:
+        plant: see `margins`.
+        gains: see `margins`.
+        setting: of the loop.
+    Returns:
+        The margins.
+    """
+    return margins(
+        plant,
+        gains,
+        loop_delay_s=setting.measurement_delay_s,
+        rate_hz=setting.rate_hz,
+        feedthrough=setting.feedthrough,
     )
 
 

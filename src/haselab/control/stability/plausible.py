@@ -16,7 +16,7 @@ from haselab.control.plants.general import AnyPlant
 from haselab.control.simulate import LoopSetting
 from haselab.control.spec import DesignSpec
 from haselab.control.stability.grid import PlantGrid
-from haselab.control.stability.margins import margins
+from haselab.control.stability.margins import loop_margins
 
 __all__ = ["Chance", "PlausibleMargins", "binomial_proportion", "plausible_margins"]
 
@@ -140,7 +140,7 @@ def _margins(
     )
     if sure:
         return (True, phase_deg, gain_db) if grid.stable[0] else (False, -phase_deg, -math.inf)
-    found = margins(plant, gains, loop_delay_s=setting.measurement_delay_s, rate_hz=setting.rate_hz)
+    found = loop_margins(plant, gains, setting)
     gain_db = found.gain_margin_db if found.stable else -math.inf
     return found.stable, found.phase_margin_deg, gain_db
 

@@ -324,7 +324,7 @@ class MotionPrediction:
             return "ok"
         worst = min(outside, key=lambda part: part.inside_band)
         return (
-            f"model error: without a constant, only {100.0 * worst.inside_band:.0f} % of the "
+            f"model error: without a common offset, only {100.0 * worst.inside_band:.0f} % of the "
             f"length values of {worst.experiment} are inside their 95 % band, which is then "
             f"±{1e6 * Z95 * float(np.median(worst.std)):.2g} um. The wider band of all lengths is "
             "that of their zero. Identify the actuator from records of such drives and loads too"

@@ -27,7 +27,7 @@ from pydantic_core import PydanticCustomError
 from haselab.base import InputError
 from haselab.base.numbers_only import numbers_only, switches_only
 from haselab.models.actuator.model_tables import CovarianceTable, Number
-from haselab.models.actuator.strain_map import StrainMap
+from haselab.models.actuator.strain_map import LARGEST_FEEDTHROUGH, StrainMap
 from haselab.models.maps import VoltageMap
 from haselab.models.plant import Plant
 
@@ -162,6 +162,10 @@ class StrainMapTable(_Section):
     held_out_coverage: Annotated[Number, Field(ge=0, le=1)] | None = None
     hysteresis_strain: Annotated[Number, Field(ge=0)] | None = None
     residual_std: Annotated[Number, Field(ge=0)] | None = None
+    feedthrough: (
+        Annotated[Number, Field(ge=-LARGEST_FEEDTHROUGH, le=LARGEST_FEEDTHROUGH)] | None
+    ) = None
+    feedthrough_std: Annotated[Number, Field(ge=0)] | None = None
 
     def map(self) -> StrainMap:
         """The map with these coefficients.

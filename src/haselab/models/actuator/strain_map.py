@@ -10,9 +10,10 @@ from numpy.typing import ArrayLike, NDArray
 
 from haselab.base import InputError, LimitError
 
-__all__ = ["StrainMap"]
+__all__ = ["LARGEST_FEEDTHROUGH", "StrainMap"]
 
 Floats = NDArray[np.float64]
+LARGEST_FEEDTHROUGH = 0.98  # above, a sensed strain says next to nothing about the length
 _BEYOND = 1.0  # of the width of the fitted range, on either side
 
 
@@ -39,6 +40,10 @@ class StrainMap:
         held_out_coverage: share inside the band, for cycles left out of fit and band.
         hysteresis_strain: largest distance between the rising and the falling branch, in strain.
         residual_std: root mean square of the deviations, in strain.
+        feedthrough: fraction of the steady-state change of this strain that appears together with
+            a step of the voltage, before the actuator moves, where the capacitance depends on the
+            voltage as well as on the length; NaN: not known.
+        feedthrough_std: its standard deviation.
     Raises:
         InputError: coefficients that are not finite, a range or a band that is empty, a map that
             turns within its range.
@@ -60,6 +65,8 @@ class StrainMap:
     held_out_coverage: float = math.nan
     hysteresis_strain: float = math.nan
     residual_std: float = math.nan
+    feedthrough: float = math.nan
+    feedthrough_std: float = math.nan
 
     def __post_init__(self) -> None:
         if not np.isfinite(self.coefficients).all():

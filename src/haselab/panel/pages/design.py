@@ -21,13 +21,13 @@ from haselab.control import (
     PidGains,
     design_controller,
     loop_response,
-    margins,
 )
+from haselab.control.feedthrough import with_feedthrough
 from haselab.control.plants.general import AnyPlant, PlantScale
 from haselab.control.plausible_design import evaluate_controller
 from haselab.control.predicted_step import predicted_step
 from haselab.control.reach import default_step
-from haselab.control.stability.margins import Margins, frequency_grid
+from haselab.control.stability.margins import Margins, frequency_grid, loop_margins
 from haselab.firmware.settings import RATE_HZ, UPDATE_DELAY_S
 from haselab.models.actuator import ControllerSection
 from haselab.panel.files import PanelFiles
@@ -104,10 +104,7 @@ class DesignedLoop:
         self, gains: PidGains | LinearController, setting: LoopSetting | None = None
     ) -> Margins:
         """Margins of the loop, as `haselab margins` computes them."""
-        used = setting or self.setting
-        return margins(
-            self.plant, gains, loop_delay_s=used.measurement_delay_s, rate_hz=used.rate_hz
-        )
+        return loop_margins(self.plant, gains, setting or self.setting)
 
     def require_limits(self) -> None:
         """Refuse a loop whose limits are not known."""
@@ -145,8 +142,9 @@ def opened(files: PanelFiles) -> DesignedLoop:
     try:
         setting = replace(setting, saturation=limits_of(path, None))
     except HaselabError as error:
+        setting = with_feedthrough(setting, tables)
         return DesignedLoop(path, sha256, plant, setting, held, str(error))
-    return DesignedLoop(path, sha256, plant, setting, held)
+    return DesignedLoop(path, sha256, plant, with_feedthrough(setting, tables), held)
 
 
 def gains_of(values: JsonObject) -> PidGains:
@@ -211,7 +209,8 @@ def _evaluate(files: PanelFiles, values: JsonObject) -> JsonObject:
     loop.require_pid()
     gains = gains_of(values)
     found = loop.margins(gains)
-    chip = margins_answer(loop.margins(gains, CHIP), CHIP)
+    at_chip = replace(CHIP, feedthrough=loop.setting.feedthrough)
+    chip = margins_answer(loop.margins(gains, at_chip), CHIP)
     step = None if loop.no_limits else _step(loop, gains, found.crossover_rad_s)
     return _response(loop, gains, found) | {"gains": asdict(gains), "chip": chip, "step": step}
 
@@ -226,8 +225,9 @@ def _response(loop: DesignedLoop, gains: PidGains | LinearController, found: Mar
     delay_s = plant.delay_s + setting.measurement_delay_s
     with np.errstate(divide="ignore", invalid="ignore"):  # a pole may be on the axis
         open_loop = loop_response(
-            plant, gains, omega, loop_delay_s=setting.measurement_delay_s, rate_hz=setting.rate_hz
-        )
+            plant, gains, omega, loop_delay_s=setting.measurement_delay_s, rate_hz=setting.rate_hz,
+            feedthrough=setting.feedthrough,
+        )  # fmt: skip
         alone = np.asarray(plant.frequency_response(omega))
     return {
         "sha256": loop.sha256,

@@ -15,7 +15,7 @@ __all__ = [
 ]
 
 
-def margins_answer(found: Margins, setting: LoopSetting) -> dict[str, float | bool]:
+def margins_answer(found: Margins, setting: LoopSetting) -> JsonObject:
     """Collect the margins for an answer.
 
     Args:
@@ -33,7 +33,17 @@ def margins_answer(found: Margins, setting: LoopSetting) -> dict[str, float | bo
         "crossover_rad_s": found.crossover_rad_s,
         "rate_hz": setting.rate_hz,
         "delay_s": setting.measurement_delay_s,
+        **_feedthrough(setting),
     }
+
+
+def _feedthrough(setting: LoopSetting) -> JsonObject:
+    """Feedthrough of the measurement and its range, where the loop has one."""
+    if setting.feedthrough == 0.0:
+        return {}
+    nominal = setting.feedthrough
+    range_ = setting.feedthrough_range or (nominal, nominal)
+    return {"feedthrough": nominal, "feedthrough_range": list(range_)}
 
 
 def _shares(found: PlausibleMargins) -> dict[str, Estimate]:
@@ -108,6 +118,7 @@ def design_answer(design: Design) -> JsonObject:
         "limits": [design.setting.saturation.low, design.setting.saturation.high],
         "rate_hz": design.setting.rate_hz,
         "delay_s": design.setting.measurement_delay_s,
+        **_feedthrough(design.setting),
         "shortfalls": list(design.shortfalls),
         **more,
     }

@@ -5,11 +5,14 @@ from __future__ import annotations
 import math
 import re
 from collections.abc import Mapping, Sequence
+from dataclasses import replace
 from pathlib import Path
 
 from haselab.base import InputError
-from haselab.control import DesignSpec, margins
-from haselab.control.plants.general import frequency_variants
+from haselab.control import DesignSpec, LoopSetting, Saturation
+from haselab.control.feedthrough import with_feedthrough
+from haselab.control.plants.general_loops import loop_variants
+from haselab.control.stability.margins import loop_margins
 from haselab.models.actuator import ControllerSection
 from haselab.pipelines.design.feedback import feedback_of
 from haselab.pipelines.design.model_file import loop_of, read_any_plant, read_origin, read_tables
@@ -122,14 +125,21 @@ def _margins(held: ControllerSection, file: Path, loop: tuple[float, float]) -> 
     """Margins with the model of the file; the worst ones where the section has its demands."""
     rate_hz, delay_s = loop
     feedback, plant = feedback_of(held, rate_hz), read_any_plant(file)
-    found = margins(plant, feedback, loop_delay_s=delay_s, rate_hz=rate_hz)
+    limits = held.limits
+    setting = LoopSetting(rate_hz, delay_s)
+    if limits is not None:
+        setting = replace(setting, saturation=Saturation(limits.low, limits.high))
+    setting = with_feedthrough(setting, read_tables(file))
+    found = loop_margins(plant, feedback, setting)
     known = {key: getattr(found, key) for key in _STATED if not key.startswith(_WORST)}
     known[_STABLE] = float(found.stable)
     stated = [key for key in _STATED if key.startswith(_WORST) and key in held.margins]
     if not (stated and held.demands):
         return known
-    covered = frequency_variants(plant, DesignSpec.from_mapping(held.demands).frequency_spread)
-    every = [margins(p, feedback, loop_delay_s=delay_s, rate_hz=rate_hz) for p in covered]
+    spread = DesignSpec.from_mapping(held.demands).frequency_spread
+    every = [
+        loop_margins(one, feedback, loop) for one, loop in loop_variants(plant, setting, spread)
+    ]
     return known | {
         key: min(getattr(one, key.removeprefix(_WORST)) for one in every) for key in stated
     }

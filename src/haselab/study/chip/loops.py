@@ -319,18 +319,23 @@ def chip_loop(program: Path, elf: Path, config: TwinConfig, seed: int, plan: Ste
     )
 
 
-def loop_row(loop: LoopRun, gains: PidGains | None, plant: Plant) -> JsonObject:
+def loop_row(
+    loop: LoopRun, gains: PidGains | None, plant: Plant, feedthrough: float = 0.0
+) -> JsonObject:
     """Metrics of a loop's step, and the margins of the fitted plant with its rate and delay.
 
     Args:
         loop: its response.
         gains: of its PID; None: it is not a PID, so no margins are computed.
         plant: as it was identified.
+        feedthrough: of the measured strain, see `LoopSetting`.
     """
     found = step_metrics(loop.time_s, loop.strain, loop.reference).trials[0]
     robust = None
     if gains is not None:
-        robust = margins(plant, gains, loop_delay_s=loop.delay_s, rate_hz=loop.rate_hz)
+        robust = margins(
+            plant, gains, loop_delay_s=loop.delay_s, rate_hz=loop.rate_hz, feedthrough=feedthrough
+        )
     return {
         "loop": loop.name,
         "delay_s": loop.delay_s,

@@ -10,6 +10,7 @@ import numpy as np
 
 from haselab.base import InputError, ResultError
 from haselab.control import DesignSpec, LoopSetting, PidGains, Saturation, design_pid
+from haselab.control.feedthrough import with_feedthrough
 from haselab.firmware import RATE_HZ
 from haselab.models.actuator import ActuatorTables, StrainMap
 from haselab.models.actuator.tables import strain_map_section, voltage_map_section
@@ -138,6 +139,7 @@ def design_miniature(tables: ActuatorTables, supply: SupplyModel, gain: float) -
             "a step. Use a supply with a higher voltage."
         )
     setting = relay_setting(supply, Saturation(_moved(lowest, zero), _moved(highest, zero)))
+    setting = with_feedthrough(setting, tables)
     found = design_pid(plant, replace(_SPEC, step=step), setting, rng=np.random.default_rng(_SEED))
     end = (zero + (1.0 + zero) * step) / plant.static_gain
     return MiniatureDesign(

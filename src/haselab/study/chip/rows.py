@@ -12,6 +12,7 @@ import numpy as np
 
 from haselab.base import Estimate, InputError, JsonObject, table_at
 from haselab.control import LoopSetting, PidGains
+from haselab.control.feedthrough import with_measured_feedthrough
 from haselab.firmware import RATE_HZ
 from haselab.rig.chip import SupplyModel
 from haselab.store.folder import read_json
@@ -109,7 +110,7 @@ def _add(
         found, header = analyse_chip_session(session)
     row, settings = recorded_row(header), Chip.from_dict(table_at(header, "chip")).settings
     gains = PidGains(settings.kp, settings.ki, settings.kd, settings.derivative_filter_s)
-    loop = _setting(header)
+    loop = with_measured_feedthrough(_setting(header), dynamics.significant_feedthrough)
     margins = margin_estimates(gains, dynamics, loop, ("phase_margin",))
     rows.quantities.update(found.quantities)
     rows.quantities[f"{row}.phase_margin"] = margins["phase_margin"]

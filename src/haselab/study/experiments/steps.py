@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
 
@@ -153,11 +154,12 @@ class StepTest(Experiment[Steps]):
                 actuator=analysis.find(KnownActuator),
             )  # fmt: skip
             return {OWN: alone}
+        feedthrough = loops.setting.feedthrough or math.nan
         pi = LoopSettings(
             loops.pi.controller(),
             loops.setting.saturation,
             maps.voltage_map,
-            maps.strain_map,
+            replace(maps.strain_map, feedthrough=feedthrough),
             video_zero_px,
         )
         found = {

@@ -9,13 +9,15 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from haselab.base import Estimate, JsonObject, ResultError
+from haselab.base import Estimate, InputError, JsonObject, ResultError
 from haselab.identify.frequency.response import estimate_frequency_response
 from haselab.identify.record import Record
 from haselab.identify.transfer.fit import TransferFit, TransferStructure, fit_transfer
+from haselab.models.actuator.strain_map import LARGEST_FEEDTHROUGH
 from haselab.models.plant import Plant, SlowMode
 from haselab.models.posterior import PlantPosterior
 from haselab.rig import RigDescription
+from haselab.sensing.feedthrough import fit_feedthrough
 from haselab.study.definition import Study
 from haselab.study.fits.maps import Maps
 from haselab.study.fits.observe import Observation
@@ -24,6 +26,7 @@ __all__ = ["Dynamics", "fit_chirp", "fit_chirp_and_steps", "fit_chirp_of_voltage
 
 Floats = NDArray[np.float64]
 _UPDATE_HZ = 100.0  # one new output per block, row S5
+_LEAST_FEEDTHROUGH = 0.05
 _BEFORE_STEP_S = 4.0  # of a step trial, to estimate its initial state
 
 
@@ -40,6 +43,8 @@ class Dynamics:
         residual_std: rms residual of the plant in the chirp, in strain.
         slow: fit of the slow branch to the steps.
         joined: fit of the fast mode to the chirp, with that branch.
+        feedthrough: of the sensed strain in the chirp, see `fit_feedthrough`; None: sensing
+            failed in it.
     """
 
     plant: Plant
@@ -50,6 +55,16 @@ class Dynamics:
     residual_std: float
     slow: TransferFit | None = None
     joined: TransferFit | None = None
+    feedthrough: Estimate | None = None
+
+    @property
+    def significant_feedthrough(self) -> Estimate | None:
+        """The feedthrough if it is clearly more than errors of the maps could cause."""
+        found = self.feedthrough
+        if found is None or not abs(found.value) - 2.0 * found.std > _LEAST_FEEDTHROUGH:
+            return None
+        limited = min(max(found.value, -LARGEST_FEEDTHROUGH), LARGEST_FEEDTHROUGH)
+        return Estimate.normal(limited, found.std, "")
 
 
 def _record(seen: Observation, maps: Maps, rig: RigDescription, from_s: float) -> Record:
@@ -60,10 +75,15 @@ def _record(seen: Observation, maps: Maps, rig: RigDescription, from_s: float) -
 
 def _held(seen: Observation, u: Floats, length_m: float, rig: RigDescription, first: int) -> Record:
     """An input that each block holds, and the strain from its first update on."""
-    zero_s = seen.block_start_s[first] + rig.switch_sample / rig.rate_hz
-    after = seen.frame_time_s >= zero_s
+    zero_s, after = _begin(seen, rig, first)
     strain = seen.length_m[after] / length_m - 1.0
     return Record(u[first:], _UPDATE_HZ, strain, seen.frame_time_s[after] - zero_s, None)
+
+
+def _begin(seen: Observation, rig: RigDescription, first: int) -> tuple[float, NDArray[np.bool_]]:
+    """Time of the first update from a block on, in s, and which frames are not before it."""
+    zero_s = float(seen.block_start_s[first]) + rig.switch_sample / rig.rate_hz
+    return zero_s, seen.frame_time_s >= zero_s
 
 
 def fit_chirp_and_steps(
@@ -114,7 +134,7 @@ def fit_chirp_and_steps(
     )
     (slow_gain, slow_tau) = slow.slow_modes[0]
     if not (np.isfinite(slow_gain.value) and np.isfinite(slow_tau.value)):
-        return _fast_alone(printed, sweep, study)
+        return _fast_alone(printed, sweep, study, _feedthrough(chirp, maps, rig, printed))
     both = _checked(
         fit_transfer(
             [sweep],
@@ -135,6 +155,7 @@ def fit_chirp_and_steps(
     )  # fmt: skip
     posterior = _posterior(both, slow)
     figures: JsonObject = {}
+    feedthrough = _feedthrough(chirp, maps, rig, both)
     if near is None:
         figures = {"chirp": _chirp_figure(sweep, printed, both, study.chirp.stop_hz)}
     else:
@@ -150,12 +171,14 @@ def fit_chirp_and_steps(
             "S20.slow_gain": slow_gain,
             "S20.slow_tau": slow_tau,
             **_second_order_results(printed),
+            **_feedthrough_result(feedthrough),
         },
         figures=figures,
         posterior=posterior,
         residual_std=float(np.sqrt(np.mean(both.residuals[0] ** 2))),
         slow=slow,
         joined=both,
+        feedthrough=feedthrough,
     )
 
 
@@ -208,7 +231,9 @@ def fit_chirp_of_voltage(
     return results, {"chirp": figure}
 
 
-def _fast_alone(printed: TransferFit, sweep: Record, study: Study) -> Dynamics:
+def _fast_alone(
+    printed: TransferFit, sweep: Record, study: Study, feedthrough: Estimate | None
+) -> Dynamics:
     """The plant of a slow branch that the steps do not determine: without it."""
     e = printed.parameters
     gain, wn, zeta, delay = (
@@ -219,12 +244,43 @@ def _fast_alone(printed: TransferFit, sweep: Record, study: Study) -> Dynamics:
         second_order=printed,
         quantities={
             "S20.gain": gain, "S20.omega_n": wn, "S20.zeta": zeta, "S20.delay": delay,
-            **_second_order_results(printed),
+            **_second_order_results(printed), **_feedthrough_result(feedthrough),
         },
         figures={"chirp": _chirp_figure(sweep, printed, None, study.chirp.stop_hz)},
         posterior=printed.posterior,
         residual_std=float(np.sqrt(np.mean(printed.residuals[0] ** 2))),
+        feedthrough=feedthrough,
     )  # fmt: skip
+
+
+def _feedthrough(
+    chirp: Observation, maps: Maps, rig: RigDescription, fit: TransferFit
+) -> Estimate | None:
+    """Feedthrough of the sensed strain in the chirp; None if sensing failed in it.
+
+    Args:
+        chirp: the chirp.
+        maps: zero strain and both maps.
+        rig: for the output's delay.
+        fit: of a transfer function to the chirp.
+    """
+    sensed = maps.strain_map.strain(chirp.capacitance_f)
+    sensed[~maps.strain_map.inside(chirp.capacitance_f)] = np.nan
+    block = np.searchsorted(chirp.block_start_s, chirp.sensed_s, side="right") - 1
+    u = maps.voltage_map.strain(chirp.drive_v[np.maximum(block, 0)])
+    _, after = _begin(chirp, rig, 0)
+    strain = chirp.length_m[after] / maps.length_m - 1.0
+    try:
+        return fit_feedthrough(
+            chirp.sensed_s, sensed, fit.plant.static_gain * u, chirp.frame_time_s[after], strain,
+            fit.modelled[0],
+        )  # fmt: skip
+    except InputError:
+        return None
+
+
+def _feedthrough_result(found: Estimate | None) -> dict[str, Estimate]:
+    return {} if found is None else {"S20.feedthrough": found}
 
 
 def _second_order(sweep: Record, near: TransferFit | None = None) -> TransferFit:

@@ -16,10 +16,11 @@ from haselab.control import (
     PidGains,
     Saturation,
     design_pid,
-    margins,
 )
+from haselab.control.feedthrough import with_measured_feedthrough
 from haselab.control.plants.general import AnyPlant
 from haselab.control.reach import reachable_range
+from haselab.control.stability.margins import loop_margins
 from haselab.models.maps import VoltageMap
 from haselab.models.plant import Plant
 from haselab.rig import RigDescription
@@ -138,7 +139,7 @@ def printed_gains(study: Study, plant: Plant) -> PidGains:
 
 
 def _holds(plant: Plant, gains: PidGains, setting: LoopSetting, least_db: float) -> bool:
-    found = margins(plant, gains, loop_delay_s=setting.measurement_delay_s, rate_hz=setting.rate_hz)
+    found = loop_margins(plant, gains, setting)
     return found.stable and found.gain_margin_db >= least_db
 
 
@@ -204,10 +205,7 @@ def _margin_note(gains: PidGains, plant: Plant, setting: LoopSetting) -> str:
     delay = f"with {_delay_text(setting, plant)}"
     if plant.delay_s <= 0.0:
         return delay
-    alone = margins(
-        replace(plant, delay_s=0.0), gains,
-        loop_delay_s=setting.measurement_delay_s, rate_hz=setting.rate_hz,
-    )  # fmt: skip
+    alone = loop_margins(replace(plant, delay_s=0.0), gains, setting)
     return f"{delay}; with the loop's delay only {alone.gain_margin_db:.3g} dB"
 
 
@@ -245,6 +243,8 @@ def design_loops(
     """
     output_s = None if output is None else output.value
     setting = given.setting if given else loop_setting(study, rig, to_volt, output_s)
+    if study.steps.feedback != "video":
+        setting = with_measured_feedthrough(setting, found.significant_feedthrough)
     held_back_s = study.steps.extra_delay_blocks * rig.block_s
     late = replace(setting, measurement_delay_s=setting.measurement_delay_s + held_back_s)
     scaled = printed_gains(study, found.plant)
@@ -361,7 +361,7 @@ def margin_estimates(
     """
 
     def numbers(plant: AnyPlant) -> NDArray[np.float64]:
-        m = margins(plant, gains, loop_delay_s=setting.measurement_delay_s, rate_hz=setting.rate_hz)
+        m = loop_margins(plant, gains, setting)
         last = m.crossovers[-1].omega_rad_s if m.crossovers else np.nan
         every = {
             "phase_margin": m.phase_margin_deg,
@@ -389,7 +389,7 @@ def _figure(plant: Plant, pi: PidGains, pid: PidGains, setting: LoopSetting) -> 
     controllers = {}
     for name, gains in (("PI", pi), ("PID", pid)):
         loop = open_response * held * gains.sampled_response(omega_rad_s, setting.rate_hz)
-        m = margins(plant, gains, loop_delay_s=setting.measurement_delay_s, rate_hz=setting.rate_hz)
+        m = loop_margins(plant, gains, setting)
         controllers[name] = {
             "magnitude": np.abs(loop),
             "phase_rad": np.unwrap(np.angle(loop)),

@@ -243,6 +243,11 @@ def _dynamics() -> dict[str, Quantity]:
             paper_note="a first-order term in addition to eq. 8: the creep in a step",
         ),
         "S20.slow_tau": Quantity("plant, time constant of the slow branch", "s"),
+        "S20.feedthrough": Quantity(
+            "feedthrough: fraction of the sensed strain that follows the voltage at once",
+            "",
+            paper_note="0 for a capacitance that depends on the length alone",
+        ),
         "S20.eq8_gain": Quantity(
             "eq. 8 alone, gain", "", 0.5, note="without a slow branch", same_as="S20.gain"
         ),

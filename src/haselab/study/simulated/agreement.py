@@ -9,19 +9,20 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
-from haselab.actuators import equilibrium_m, linearise
+from haselab.actuators import OperatingPoint, equilibrium_m, feedthrough, linearise
 from haselab.base import LimitError, ResultError
 from haselab.control import (
     DesignSpec,
     LoopSetting,
     PidGains,
     Saturation,
-    margins,
     simulate_loop,
 )
-from haselab.control.plants.general import AnyPlant, frequency_variants
+from haselab.control.feedthrough import with_feedthrough
+from haselab.control.plants.general_loops import loop_variants
+from haselab.control.stability.margins import loop_margins
 from haselab.firmware import CAPACITANCE_NOISE
-from haselab.models.actuator.strain_map import StrainMap
+from haselab.models.actuator.strain_map import LARGEST_FEEDTHROUGH, StrainMap
 from haselab.models.rational import RationalModel
 from haselab.rig.chip import ChipDesign
 from haselab.rig.twin.config import TwinConfig
@@ -39,6 +40,7 @@ __all__ = [
 ]
 
 _FROM_S = -1.0  # of the step: from here on the responses are compared
+_SAME_FEEDTHROUGH = 0.05
 _SOFTENED = 0.01  # loss of stiffness that is a cause
 _MAP_POINTS = 65  # voltages at which the strain map is checked
 _CAPACITANCES = 10_001  # at which the ends of the step are searched
@@ -121,8 +123,17 @@ class StepCase:
     def is_robust(self) -> bool:
         """Whether the loop is stable with each natural frequency that the design covers."""
         return all(
-            _stable(self, plant) for plant in frequency_variants(self.design.plant, self.spread)
+            loop_margins(plant, self.gains, loop).stable
+            for plant, loop in loop_variants(self.design.plant, self.loop, self.spread)
         )
+
+    @property
+    def loop(self) -> LoopSetting:
+        """The chip's loop, with the feedthrough of the actuator file."""
+        settings = self.design.settings
+        limits = Saturation(settings.strain_low, settings.strain_high)
+        setting = LoopSetting(FAST.rate_hz, CHIP_DELAY_S, limits)
+        return with_feedthrough(setting, self.design.tables)
 
     def differences(self, one: LoopRun, other: LoopRun) -> NDArray[np.float64]:
         """Difference of two responses at each time, as a fraction of the step.
@@ -186,6 +197,7 @@ def predicted_loop(
     white = None
     if noise:
         white = np.random.default_rng(case.seed).normal(0.0, case.noise_std, run.time_s.size)
+    setting = replace(setting, feedthrough=case.loop.feedthrough)
     trace = simulate_loop(plant, case.gains, run.reference, setting, measurement_noise=white)
     return replace(run, strain=trace.y)
 
@@ -247,29 +259,45 @@ def check_stable(case: StepCase) -> None:
     Raises:
         ResultError: The loop is unstable.
     """
-    if not _stable(case, case.design.plant):
+    if not loop_margins(case.design.plant, case.gains, case.loop).stable:
         raise ResultError(
             f"The loop of [model] and [controller] is unstable at the chip's {FAST.rate_hz:g} Hz "
             f"with a delay of {1e3 * CHIP_DELAY_S:.3g} ms. Design it again with --rate-hz and "
             f"--delay-s: {case.design.path}"
         )
-    if not _stable(case, _linear(case, case.plan.before)):
+    twins = _feedthrough(case, case.plan.before)
+    on_twin = replace(case.loop, feedthrough=twins, feedthrough_range=None)
+    if not loop_margins(_linear(case, case.plan.before), case.gains, on_twin).stable:
         raise ResultError(
-            f"The loop is unstable on this twin: {_two_plants(case)}. Choose the twin of this "
-            f"actuator with --twin or --reading: {case.design.path}"
+            f"The loop is unstable on this twin: {_two_plants(case)}{_twins_feedthrough(case)}. "
+            f"Choose the twin of this actuator with --twin or --reading: {case.design.path}"
         )
 
 
-def _stable(case: StepCase, plant: AnyPlant) -> bool:
-    """Whether the loop with a plant is stable at the chip's rate and delay."""
-    return margins(plant, case.gains, loop_delay_s=CHIP_DELAY_S, rate_hz=FAST.rate_hz).stable
+def _feedthrough_text(case: StepCase) -> str:
+    """Range of the feedthrough, if the loop has one."""
+    if case.loop.feedthrough_range is None:
+        return ""
+    low, high = case.loop.feedthrough_range
+    return f" or a feedthrough of {low:.2g} to {high:.2g}"
+
+
+def _twins_feedthrough(case: StepCase) -> str:
+    """Feedthrough of the twin and of the file, if they differ."""
+    twins, known = _feedthrough(case, case.plan.before), case.loop.feedthrough
+    if abs(twins - known) < _SAME_FEEDTHROUGH:
+        return ""
+    return (
+        f", and {twins:.2g} of its sensed strain follows the drive at once, but the file states "
+        f"feedthrough = {known:.2g} in [sensing.strain_map]"
+    )
 
 
 def _unstable_within_spread(case: StepCase) -> str:
     return (
         f"with a natural frequency that differs from [model] by {100.0 * case.spread:.3g} % "
-        "(frequency_spread), the loop is unstable, so any difference would be tolerated. Design "
-        "the controller again with haselab design"
+        f"(frequency_spread){_feedthrough_text(case)}, the loop is unstable, so any difference "
+        "would be tolerated. Design the controller again with haselab design"
     )
 
 
@@ -321,21 +349,34 @@ def _causes(desktop: LoopRun, chip: LoopRun, case: StepCase) -> Iterator[str]:
 
 def _linear(case: StepCase, strain: float) -> RationalModel:
     """The softened twin from corrected strain to strain, where the model reaches a strain."""
+    volt, high_v = case.design.tables.voltage_map(), _gain_v(case)
+    point, corrected = _point(case, strain)
+    gain = point.gain_m_per_v * high_v * float(volt.slope_v(corrected)) / case.plan.zero_length_m
+    bottom, top = np.real(np.poly(point.poles)), np.real(np.poly(point.zeros))
+    return RationalModel(tuple(gain * bottom[-1] / top[-1] * top), tuple(bottom))
+
+
+def _point(case: StepCase, strain: float) -> tuple[OperatingPoint, float]:
+    """The softened twin where the model reaches a strain, and the corrected strain there."""
     settings, volt = case.design.settings, case.design.tables.voltage_map()
     corrected = strain / case.design.plant.static_gain
     corrected = min(max(corrected, settings.strain_low), settings.strain_high)
     law, load = case.config.law, case.config.load
-    high_v = _gain_v(case)
     point = linearise(
         law,
-        high_v * max(float(volt.voltage_v(corrected)), 0.0),
+        _gain_v(case) * max(float(volt.voltage_v(corrected)), 0.0),
         load.mass_kg * GRAVITY_M_S2,
         load.mass_kg + load.added_inertia_kg,
         longest_m=law.length_limits_m.high,
     )
-    gain = point.gain_m_per_v * high_v * float(volt.slope_v(corrected)) / case.plan.zero_length_m
-    bottom, top = np.real(np.poly(point.poles)), np.real(np.poly(point.zeros))
-    return RationalModel(tuple(gain * bottom[-1] / top[-1] * top), tuple(bottom))
+    return point, corrected
+
+
+def _feedthrough(case: StepCase, strain: float) -> float:
+    """Feedthrough of the softened twin where the model reaches a strain."""
+    point, _ = _point(case, strain)
+    found = feedthrough(case.config.law, point.length_m, point.voltage_v, point.gain_m_per_v)
+    return float(np.clip(found, -LARGEST_FEEDTHROUGH, LARGEST_FEEDTHROUGH))
 
 
 def _gain_v(case: StepCase) -> float:

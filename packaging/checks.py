@@ -23,7 +23,7 @@ _INSTALL_S = 60.0
 _MODULES = ("_camera", "_core", "_identify", "_loops", "_models", "_motion", "_sense", "_track",
             "_twin")  # fmt: skip
 _SOURCES = ("core", "firmware/app", "firmware/board", "firmware/protocol", "native/twin",
-            "native/motion", "rigs")  # fmt: skip
+            "native/motion", "rigs", "examples/kinds")  # fmt: skip
 _COMMANDS = (
     "doctor",
     "init my-actuator --out actuator.toml",
@@ -32,6 +32,8 @@ _COMMANDS = (
     "example chirp --out chirp",
     "identify transfer chirp/chirp.csv --input Drive --output Displacement --out model.json",
     "export bench/twin-hz.toml --to fmu --out twin.fmu",
+    "example peano-hasel --out peano",
+    "plan feasibility peano/study.toml --rig peano/rig.toml",
 )
 _WITHOUT_COMPILER = ("cc", "gcc", "c++", "g++", "clang", "clang++")
 

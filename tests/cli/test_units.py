@@ -9,6 +9,7 @@ import pytest
 
 from haselab.base import Estimate, InputError
 from haselab.cli.main import main
+from haselab.cli.model.margins import command as margins
 from haselab.cli.readable import readable
 from haselab.control.gains import gain_units
 from haselab.models.actuator import ActuatorTables
@@ -160,3 +161,11 @@ def test_maps_of_one_kind_are_not_played_on_a_twin_of_another() -> None:
     refuse_other_kind(ActuatorTables.model_validate({}), path, twin)
     same = ActuatorTables.model_validate({"actuator": {"kind": "planar-hasel"}})
     refuse_other_kind(same, path, twin)
+
+
+def test_the_help_of_margins_has_the_units_of_the_gains_for_any_model():
+    help_text = {option.name: option.help for option in margins.params if hasattr(option, "help")}
+    for source, output in (("V", "m"), ("1", "1")):
+        for name in ("ki", "kd"):
+            assert f" {gain_units(source, output)[name]}" in help_text[name]
+    assert gain_units("V", "m")["kp"] in help_text["kp"]

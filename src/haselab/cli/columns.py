@@ -14,6 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from haselab.base import InputError
+from haselab.cli.options import OTHER_SIGN
 from haselab.models.actuator import ActuatorTables
 from haselab.store.columns.archive import MissingColumnsError
 from haselab.store.columns.reader import open_archive
@@ -33,6 +34,7 @@ __all__ = [
     "note_seconds",
     "note_units",
     "options_of_each",
+    "refuse_other_sign",
     "strains_of",
 ]
 
@@ -52,12 +54,14 @@ class Quantity:
         names: default names of the column; the first that the file has is used.
         si: the SI unit of the quantity; None: any.
         what: the quantity, for --help.
+        signed: whether it can be negative, so that the other sign of a column makes sense.
     """
 
     option: str
     names: tuple[str, ...]
     si: str | None
     what: str
+    signed: bool = True
 
     @property
     def parameter(self) -> str:
@@ -66,11 +70,28 @@ class Quantity:
 
     def column(self, file: Path, given: str | None) -> str:
         """Return the name of the column that holds this quantity in a file."""
+        if given is not None and not self.signed:
+            refuse_other_sign(self.option, given, file)
         if given is not None or len(self.names) == 1:
             return given or self.names[0]
         with open_archive(file) as archive:
             found = next((name for name in self.names if archive.locate(name) is not None), None)
         return found or self.names[0]
+
+
+def refuse_other_sign(option: str, column: str, file: Path) -> None:
+    """Refuse a minus before the name of a column that cannot be negative.
+
+    Raises:
+        InputError: there is one.
+    """
+    if column.startswith("-"):
+        with open_archive(file) as archive:
+            if archive.is_negative(column):
+                raise InputError(
+                    f"{option} {column} asks for the other sign, but its values cannot be "
+                    f"negative. Name the column without the minus: {file}"
+                )
 
 
 STRAIN = Quantity("--strain", ("strain",), "1", "the strain")
@@ -79,9 +100,10 @@ STRAIN = Quantity("--strain", ("strain",), "1", "the strain")
 def column_option(quantity: Quantity) -> Callable[[F], F]:
     """Add the option that names the column of a quantity (passed on as `NAME_column`)."""
     default = " or ".join(quantity.names)
+    sign = f"; {OTHER_SIGN}" if quantity.signed else ""
     return click.option(
         quantity.option, quantity.parameter, metavar="COLUMN",
-        help=f"Name the column of {quantity.what}. Default: {default}.",
+        help=f"Name the column of {quantity.what}{sign}. Default: {default}.",
     )  # fmt: skip
 
 
@@ -213,12 +235,13 @@ def strains_of(
             f"[actuator.geometry] of an actuator file, and add --actuator FILE: {file}"
         )
     least, largest = float(np.nanmin(values)), float(np.nanmax(values))
-    if _LENGTHS[0] * zero_m < least and largest < _LENGTHS[1] * zero_m:
+    sensor_m = known.actuator.geometry.sensor_zero_m if known is not None else None
+    near_zero = float(np.nanmin(np.abs(values))) < _NEAREST_ZERO * zero_m
+    if _are_lengths(least, largest, zero_m):
         what, strain = "length / zero_length_m - 1", values / zero_m - 1.0
-    elif (
-        float(np.nanmin(np.abs(values))) < _NEAREST_ZERO * zero_m and max(-least, largest) < zero_m
+    elif (near_zero and max(-least, largest) < zero_m) or (
+        sensor_m is not None and _are_lengths(least + sensor_m, largest + sensor_m, zero_m)
     ):
-        sensor_m = known.actuator.geometry.sensor_zero_m if known is not None else None
         what, strain = "displacement / zero_length_m", values / zero_m
         if sensor_m is not None:
             what = f"(displacement + {sensor_m:g} m) / zero_length_m - 1"
@@ -227,8 +250,10 @@ def strains_of(
         raise InputError(
             f"Column {column} is from {least:.4g} to {largest:.4g} m, but the length at strain 0 "
             f"is zero_length_m = {zero_m:g} m, so its values are neither displacements nor lengths."
-            " Correct zero_length_m, or state the unit of the column with --unit. A distance that "
-            f"falls while the actuator lengthens must be subtracted from a constant first: {file}"
+            " Correct zero_length_m, or state the unit of the column with --unit. For a reading "
+            "that falls while the actuator lengthens, put a minus before the name of the column, "
+            "and state the length at which it reads 0 as sensor_zero_m in [actuator.geometry]: "
+            f"{file}"
         )
     low, high = float(np.nanmin(strain)), float(np.nanmax(strain))
     click.echo(
@@ -236,6 +261,11 @@ def strains_of(
         f"the actuator file. {file}", err=True,
     )  # fmt: skip
     return np.asarray(strain)
+
+
+def _are_lengths(least_m: float, largest_m: float, zero_m: float) -> bool:
+    """Whether an actuator of this length at strain 0 may have such lengths."""
+    return _LENGTHS[0] * zero_m < least_m and largest_m < _LENGTHS[1] * zero_m
 
 
 def options_of_each(files: Sequence[Path], columns: ColumnOptions) -> list[ColumnOptions]:

@@ -7,10 +7,11 @@ from typing import Any, TypeVar
 
 import click
 
-__all__ = ["shared_option"]
+__all__ = ["OTHER_SIGN", "shared_option"]
 
 F = TypeVar("F", bound=Callable[..., Any])
 
+OTHER_SIGN = "a minus before the name (-Laser) changes the sign"
 # option: (metavar, None for click's own; what it does)
 _SHARED: dict[str, tuple[str | None, str]] = {
     "--actuator": ("A.toml", "Use this actuator file."),
@@ -45,8 +46,8 @@ _SHARED: dict[str, tuple[str | None, str]] = {
         "Choose how the input behaves between its samples. zero: it is held; first: straight "
         "lines; band-limited: it was measured behind an anti-aliasing filter.",
     ),
-    "--i": ("COLUMN", "Name the column of the current monitor, in V."),
-    "--input": ("COLUMN", "Name the column of the input."),
+    "--i": ("COLUMN", f"Name the column of the current monitor, in V; {OTHER_SIGN}."),
+    "--input": ("COLUMN", f"Name the column of the input; {OTHER_SIGN}."),
     "--keep-means": (None, "Keep the means of the columns instead of subtracting them."),
     "--keep-video": (None, "Choose which camera frames to keep."),
     "--kind": (None, "Choose the kind of actuator."),
@@ -59,7 +60,7 @@ _SHARED: dict[str, tuple[str | None, str]] = {
         "Set the TCP port of the page. 0 uses a free one.",
     ),
     "--out": (None, "Write the result to this path."),
-    "--output": ("COLUMN", "Name the column of the output."),
+    "--output": ("COLUMN", f"Name the column of the output; {OTHER_SIGN}."),
     "--physical-model/--no-physical-model": (
         None,
         "Identify the physical model from the recording.",
@@ -83,7 +84,7 @@ _SHARED: dict[str, tuple[str | None, str]] = {
         "FILE.toml",
         "Use the twin of this TWIN.toml, or of the identified actuator of this actuator file.",
     ),
-    "--v": ("COLUMN", "Name the column of the voltage monitor, in V."),
+    "--v": ("COLUMN", f"Name the column of the voltage monitor, in V; {OTHER_SIGN}."),
     "--volt-per-monitor-volt": (None, "Set the scale of the voltage monitor in V/V."),
     "--workers": (None, "Use this many processes. Default: one for each processor."),
     "--yes": (None, "Skip the confirmation."),

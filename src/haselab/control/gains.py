@@ -60,9 +60,10 @@ class PidGains:
     $u_k = k_p e_k + I_k - k_d (f_k - f_{k-1})/T$.
 
     Args:
-        kp: proportional gain, dimensionless.
-        ki: integral gain, in 1/s.
-        kd: derivative gain, in s.
+        kp: proportional gain, in units of the output per unit of the input; a pure number from
+            strain to strain.
+        ki: integral gain, in the unit of `kp` per second.
+        kd: derivative gain, in the unit of `kp` times seconds.
         derivative_filter_s: time constant of the measurement's filter, in s.
     Raises:
         InputError: a gain is negative or not finite.

@@ -19,12 +19,15 @@ __all__ = ["chart_plans"]
 _NAME = re.compile(r"[a-z0-9][a-z0-9-]{0,60}", re.IGNORECASE)
 
 
-def chart_plans(analysis: Mapping[str, Any], taken: frozenset[str]) -> tuple[FigurePlan, ...]:
+def chart_plans(
+    analysis: Mapping[str, Any], taken: frozenset[str], after: int
+) -> tuple[FigurePlan, ...]:
     """Plan the figures that section `charts` of analysis.json describes.
 
     Args:
         analysis: parsed analysis.json.
         taken: names of the report's own figures.
+        after: number of the last of them.
     Returns:
         One plan per chart, in the file's order. A chart whose name is taken or cannot be a file
         name gets a number instead.
@@ -40,7 +43,8 @@ def chart_plans(analysis: Mapping[str, Any], taken: frozenset[str]) -> tuple[Fig
         names.add(name)
         title = str(chart.get("title") or name)
         panel = Panel("", title, functools.partial(_draw, at, chart), wide=True, height_in=3.2)
-        plans.append(FigurePlan(name, f"Figure E{at}", str(chart.get("caption") or ""), (panel,)))
+        caption = str(chart.get("caption") or "")
+        plans.append(FigurePlan(name, f"Figure {after + at}", title, caption, (panel,)))
     return tuple(plans)
 
 

@@ -14,8 +14,10 @@ from haselab.report.charts import chart_plans
 from haselab.report.figures import PLANS, DrawnFigure, FigurePlan, draw_figure
 from haselab.report.folder import RunFolder, read_folder
 from haselab.report.numbers import value_text
+from haselab.report.overview.facts import facts, loop_table
+from haselab.report.overview.groups import is_empty, result_groups
+from haselab.report.overview.summary import summary_text
 from haselab.report.results import Results
-from haselab.report.summary import summary_text
 from haselab.store.claim import refuse_linked_folders
 from haselab.store.folder import write_text
 
@@ -27,10 +29,11 @@ _METRICS = {
     "settling_time_s": "Settling time",
     "overshoot": "Overshoot, including ringing",
     "peak_excess": "Peak beyond desired strain",
-    "error": "Final error",
+    "error": "Final error, of the step",
     "delay_s": "Delay",
     "phase_margin_deg": "Phase margin (°)",
 }
+_LAST_FIGURE = 1 + len(PLANS)  # the paper's figure 1 has no data
 # Read as one paragraph, in the table's order of columns.
 _DEFINITIONS = {
     "rise_time_s": "The way of a step leads from the strain before it to the final strain, the "
@@ -109,7 +112,10 @@ def compose_page(run: RunFolder) -> Page:
         summary=summary_text(run.results),
         unverified=str(run.results.provenance.get("unverified", "")),
         simulated=run.results.simulated,
-        quantities=rows,
+        facts=facts(run),
+        loops=loop_table(run.results),
+        groups=result_groups(rows, run.analysis),
+        empty=[row for row in rows if is_empty(row)],
         has_noise_free=any(row.noise_free is not None for row in rows),
         reading=_reading(run.analysis.get("reading")),
         figures=drawings,
@@ -150,7 +156,10 @@ def _plans(analysis: Mapping[str, Any]) -> tuple[FigurePlan, ...]:
         for plan in PLANS
         if (only is None or plan.name in only) and (not plan.needs or plan.needs in analysis)
     )
-    return (*drawn, *chart_plans(analysis, frozenset(plan.name for plan in PLANS)))
+    return (
+        *drawn,
+        *chart_plans(analysis, frozenset(plan.name for plan in PLANS), _LAST_FIGURE),
+    )
 
 
 def save_page(page: Page, folder: Path, path: Path) -> Path:

@@ -11,8 +11,8 @@ import jinja2
 from haselab.base.chart import Chart, Curve, Panel
 from haselab.report.chart_file import draw_chart
 from haselab.report.numbers import number_text
+from haselab.report.overview.summary import counted
 from haselab.report.style import figure_style, inline_svg, to_svg
-from haselab.report.summary import counted
 from haselab.scoreboard import TASKS, Entry, Game, Played, Row, board_rows, limits_of
 
 __all__ = ["scoreboard_page"]

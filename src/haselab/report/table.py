@@ -7,8 +7,8 @@ from collections.abc import Mapping
 from typing import Any
 
 from haselab.report.numbers import value_text
+from haselab.report.overview.summary import counted, verdict_counts
 from haselab.report.results import Quantity, Results
-from haselab.report.summary import counted, verdict_counts
 
 __all__ = ["results_table"]
 

@@ -19,6 +19,7 @@ class CheckResult:
         passed: whether it is correct.
         advice: what to change if it is not, else empty.
         recommended: keys of the rig file, such as `daq.skew_s`, with the measured values.
+        criterion: what is accepted, with the limits that were used; empty if nothing was judged.
     """
 
     step: str
@@ -27,6 +28,7 @@ class CheckResult:
     passed: bool
     advice: str = ""
     recommended: Mapping[str, float] = field(default_factory=dict)
+    criterion: str = ""
 
     def __post_init__(self) -> None:
         object.__setattr__(self, "passed", bool(self.passed))  # JSON does not accept numpy's bool

@@ -17,6 +17,7 @@ from haselab.store.claim import refuse_linked_folders
 from haselab.store.folder import write_json
 from haselab.study.analysis import experiments_of
 from haselab.study.definition import Study
+from haselab.study.experiments.foreign import rows_of_experiment
 from haselab.study.fits.dynamics import Dynamics
 from haselab.study.fits.loops import Loops, pid_demands
 from haselab.study.fits.maps import Maps
@@ -165,6 +166,9 @@ def _sections(found: Findings, study: Study, header: Mapping[str, Any]) -> dict[
     """Content of analysis.json: data of the figures; for the reference study also the paper."""
     charts = [chart.to_dict() for chart in found.charts]
     sections: dict[str, Any] = {**found.figures, **({"charts": charts} if charts else {})}
+    sections["experiments"] = [
+        {"title": one.title, "ids": list(rows_of_experiment(one))} for one in experiments_of(study)
+    ]
     if not study.is_reference:
         return {**sections, **_without_paper(found, study)}
     rows = [

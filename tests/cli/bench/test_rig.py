@@ -303,3 +303,19 @@ def test_the_status_names_armed_benches_and_why_others_were_made_safe(
         assert json.loads(out.read_text())["benches"] == [bench]
     finally:
         gate.interlock.close()
+
+
+def test_each_check_says_what_it_accepts(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """The limits are those of the twin: half a sample of 200 kHz, 1 % of a drive of 2 V."""
+    (tmp_path / "twin.toml").write_text('kind = "twin"\n')
+    code, out, _ = call(capsys, "rig", "check", tmp_path / "twin.toml", "--json")
+    checks = {each["what"]: each["criterion"] for each in json.loads(out)["checks"]}
+    assert code == 0
+    assert [what for what, criterion in checks.items() if not criterion] == ["rig file"]
+    assert checks["gaps"] == "below 0.0025 ms, half a sample"
+    assert checks["0 V at once on a twin"] == "below 0.02 V"
+    assert checks["size of an output on a twin"] == "within 2 %"
+    code, out, _ = call(capsys, "rig", "check", tmp_path / "twin.toml")
+    assert "0.000 ms between blocks (accepted: below 0.0025 ms, half a sample)" in out

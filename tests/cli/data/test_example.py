@@ -16,6 +16,8 @@ from haselab.pipelines.examples.packages import PACKAGES
 from haselab.rig.twin.config import twin_of_reading
 from haselab.store.columns.table import read_table
 
+KINDS = Path(__file__).resolve().parents[3] / "examples" / "kinds"
+
 
 def code_of(*arguments: object) -> int:
     with pytest.raises(SystemExit) as ended:
@@ -71,6 +73,8 @@ def test_the_commands_of_each_readme_run_in_their_order(tmp_path, monkeypatch, c
     assert commands
     for command in commands:
         words = shlex.split(command)[1:]
+        if words[:2] == ["run", "study.toml"]:
+            continue  # tests/study/test_kinds.py plays these studies, for half a minute each
         assert code_of(*words) == 0, capsys.readouterr().err
         printed = capsys.readouterr().out
         assert max(map(len, printed.splitlines())) <= 250, "no dictionaries on one line"
@@ -78,6 +82,13 @@ def test_the_commands_of_each_readme_run_in_their_order(tmp_path, monkeypatch, c
             if option in words:
                 assert Path(words[words.index(option) + 1]).exists()
     assert sum(path.stat().st_size for path in Path().glob("*.csv")) < 4_000_000
+
+
+@pytest.mark.parametrize("name", [path.name for path in sorted(KINDS.iterdir())])
+def test_the_study_of_a_kind_is_a_copy_of_the_one_that_the_tests_play(tmp_path, name):
+    assert code_of("example", name, "--out", tmp_path) == 0
+    for file in (KINDS / name).iterdir():
+        assert (tmp_path / file.name).read_bytes() == file.read_bytes()
 
 
 def test_the_data_are_the_same_each_time(tmp_path):

@@ -53,6 +53,7 @@ def test_compare_applies_the_curve_of_the_model_file(tmp_path, kind, curve):
     # The error is the noise, and that of 7 parameters from 3000 samples.
     assert found["rms_error"] == pytest.approx(NOISE, rel=4.0 / np.sqrt(2.0 * 3000) + 7 / 3000)
     assert found["inside_band"] is None and found["status"] == "ok"
+    assert "a model file has only that of the linear part" in found["band"]
     fit = fit_nonlinear(hl.records(first, hold="zero"), TransferStructure(), kind)
     in_python = fit.compare(hl.records(new, hold="zero"))
     assert found["fit_percent"] == pytest.approx(in_python.fit_percent, abs=1e-6)

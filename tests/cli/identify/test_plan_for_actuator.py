@@ -9,8 +9,12 @@ from click.testing import CliRunner
 
 from haselab.actuators import PlanarHasel
 from haselab.base import InputError, ResultError
+from haselab.cli.identify.actuator import each_once
 from haselab.cli.identify.group import command as identify
+from haselab.cli.readable import readable
 from haselab.identify.physical.unknowns import Unknowns
+from haselab.pipelines.planning.catalogue import Candidate
+from haselab.pipelines.planning.proposal import Proposal
 from haselab.store.toml import toml_text
 from haselab.study.definition import checked_study
 
@@ -165,3 +169,20 @@ def test_where_nothing_is_measured_no_experiment_helps(tmp_path):
     records = {"gain_v_per_v": 5000.0, "highest_drive_v": 1.0}
     with pytest.raises(ResultError, match=r"No experiment of the catalogue reduces"):
         run(file_of(tmp_path, records=records), "--goal", GOAL)
+
+
+def test_a_study_for_several_parameters_is_printed_once():
+    drop = Candidate("drop", {"free_response": {"baseline_v": 1.0}})
+    load = Candidate("static load", {"static_load": {"masses_kg": [0.1]}})
+    proposals = [
+        Proposal("a", drop, 6.0, 4.0, 0.05, 0.1, ("Mind the mass.",)),
+        Proposal("b", load, 35.0, 2.0, 0.08, 0.1),
+        Proposal("c", drop, 6.0, 3.0, 0.5, 0.1, ("Mind the mass.", "Mind c.")),
+    ]
+    lines = readable({"experiments": each_once(proposals)})
+    assert sum("free_response" in line for line in lines) == 1
+    assert [" ".join(line.split()) for line in lines[:7]] == [
+        "experiments", "1", "experiment drop", "duration_s 6", "relative_std", "a 4 to 0.05",
+        "c 3 to 0.5 (not enough)",
+    ]  # fmt: skip
+    assert sum("Mind the mass." in line for line in lines) == 1

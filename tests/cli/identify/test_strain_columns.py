@@ -20,6 +20,7 @@ ACTUATOR = f'[actuator]\nkind = "planar-hasel"\n[actuator.geometry]\nzero_length
 def capacitance(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
     monkeypatch.chdir(tmp_path)
     Path("A.toml").write_text(ACTUATOR)
+    Path("B.toml").write_text(ACTUATOR + "sensor_zero_m = 0.11\n")
     farad = 5e-10 + STRAIN / SLOPE_PER_F + 1e-14 * RNG.standard_normal(STRAIN.size)
     rows = np.column_stack([TIME_S[::5], farad[::5]])
     np.savetxt("C.csv", rows, "%.9g", ",", header="time_s,capacitance_f", comments="")
@@ -56,6 +57,11 @@ def slope(printed: str) -> float:
          ("--strain", "Laser", "--actuator", "A.toml"), "strain = displacement / zero_length_m"),
         ("t;Laser [mm]", 1.0, 1e3 * ZERO_M, 1e3 * ZERO_M,
          ("--strain", "Laser", "--actuator", "A.toml"), "strain = length / zero_length_m - 1"),
+        ("t;x", 1.0, -1.0, 0.0, ("--strain", "-x"), ""),
+        ("t;Laser [mm]", 1.0, -1e3 * ZERO_M, 0.0,
+         ("--strain", "-Laser", "--actuator", "A.toml"), "strain = displacement / zero_length_m"),
+        ("t;Laser [mm]", 1.0, -1e3 * ZERO_M, 50.0,  # the distance to a laser 110 mm below the top
+         ("--strain", "-Laser", "--actuator", "B.toml"), "strain = (displacement + 0.11 m) /"),
     ],
 )  # fmt: skip
 def test_the_slope_is_that_of_the_strain(
@@ -81,6 +87,8 @@ def test_the_slope_is_that_of_the_strain(
          "its values are neither displacements nor lengths"),
         ("t;x", 1.0, 60.0 * STRAIN, ("--strain", "x"), "'x=mm' if it is a displacement"),
         ("t;x [V]", 1.0, STRAIN, ("--strain", "x"), "is in V, but --strain needs the strain"),
+        ("t;x [mm]", 1.0, 50.0 - 60.0 * STRAIN, ("--strain", "-x", "--actuator", "A.toml"),
+         "state the length at which it reads 0 as sensor_zero_m in [actuator.geometry]"),
     ],
 )  # fmt: skip
 def test_a_column_that_is_not_a_strain_is_refused_in_one_line(
@@ -93,6 +101,14 @@ def test_a_column_that_is_not_a_strain_is_refused_in_one_line(
     assert code == 2 and out == "" and said in err.splitlines()[-1]
     assert "S.csv" in err.splitlines()[-1] and "{" not in err
     assert Path("A.toml").read_text() == before
+
+
+def test_a_capacitance_with_the_other_sign_is_refused(
+    capacitance: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    strain_file("t;x", 1.0, STRAIN)
+    code, out, err = fitted(capsys, "--strain", "x", "--capacitance", "-capacitance_f")
+    assert (code, out) == (2, "") and "its values cannot be negative" in err.splitlines()[-1]
 
 
 def test_a_voltage_map_takes_displacements_too(

@@ -74,7 +74,7 @@ def test_tools_that_are_missing_are_one_line_of_the_report(
 def test_a_study_without_such_experiments_has_no_rows_of_them_and_says_why(tmp_path: Path) -> None:
     rows = chip_rows(tmp_path, None)  # type: ignore[arg-type]
     assert (rows.quantities, rows.notes) == ({}, {})
-    for name in ("chip", "miniature"):  # figures S4 and S5 say why, so that no number is missing
+    for name in ("chip", "miniature"):  # figures 11 and 12 say why, so that no number is missing
         assert "only 'haselab reproduce' plays it" in rows.figures[name]["left_out"]
 
 

@@ -6,6 +6,7 @@ import contextlib
 import json
 import math
 import os
+import re
 import socket
 import stat
 import sys
@@ -377,3 +378,13 @@ def test_a_seventeenth_client_is_turned_away_and_a_place_that_is_left_is_given_a
         with client(served.client.address) as late, contextlib.suppress(ConnectionError):
             assert asked(late, b'{"do": "meters"}\n') == b""
     assert math.isfinite(served.hub.output_v)
+
+
+def test_the_rig_file_has_the_numbers_of_the_twin_in_their_shortest_form():
+    """A product and its quotient, such as 3 * 0.0498 / 3, differ from 0.0498 in the last bit."""
+    config = twin_of_reading("hz")
+    with ServedTwin(config, 1, pace=0.0) as served:
+        text = served.rig_file()
+    assert f"shell_width_m = {config.shell.width_m!r}\n" in text
+    assert f"shell_thickness_m = {config.shell.thickness_m!r}\n" in text
+    assert not re.search(r"\d{13}", text)

@@ -89,6 +89,7 @@ def _mock(file: RigFile, path: Path) -> Iterator[CheckResult]:
             f"{at_input_v:.3g} V at the voltage monitor, range {file.daq.range_v:g} V",
             at_input_v <= _RANGE_SHARE * file.daq.range_v,
             "Raise daq.range_v, or lower daq.drive_high_v",
+            criterion=f"at most {100.0 * _RANGE_SHARE:g} % of the range",
         )
         yield CheckResult(
             "mock",
@@ -101,7 +102,7 @@ def _mock(file: RigFile, path: Path) -> Iterator[CheckResult]:
         return
     rig = make_twin(twin_of_reading("hz"), 1)
     for each in (*dry_checks(rig, DryPlan()), *live_checks(rig, LivePlan())):
-        yield CheckResult("mock", f"{each.what} on a twin", each.found, each.passed, each.advice)
+        yield replace(each, step="mock", what=f"{each.what} on a twin", recommended={})
 
 
 def _drivers(file: BenchConfig) -> CheckResult:
@@ -382,7 +383,8 @@ def _recommend(checks: list[CheckResult], file: RigFile) -> None:
 def _print_check(each: CheckResult, as_json: bool) -> None:
     if not as_json:
         mark = "ok" if each.passed else "FAILED"
-        click.echo(f"{mark:6s}  {each.step:5s} {each.what:32s} {each.found}")
+        limits = f" (accepted: {each.criterion})" if each.criterion else ""
+        click.echo(f"{mark:6s}  {each.step:5s} {each.what:32s} {each.found}{limits}")
 
 
 def _answer(

@@ -12,9 +12,15 @@ import click
 import numpy as np
 
 from haselab.base import InputError
-from haselab.cli.columns import advice_on_columns, check_strain, column_options, note_seconds
+from haselab.cli.columns import (
+    advice_on_columns,
+    check_strain,
+    column_options,
+    note_seconds,
+    refuse_other_sign,
+)
 from haselab.cli.common import Real, answer_options, emit, unverified_option, warn_unverified
-from haselab.cli.options import shared_option
+from haselab.cli.options import OTHER_SIGN, shared_option
 from haselab.cli.output import OutputRule
 from haselab.pipelines.sensing.series import derived_series
 from haselab.runtime.observer import FIDUCIALS
@@ -113,17 +119,17 @@ def _export(
 @click.option(
     "--drive", metavar="COLUMN",
     help="Name the column of the drive voltage before the amplifier, in V; the median of each "
-    "block is kept. Default: none.",
+    f"block is kept; {OTHER_SIGN}. Default: none.",
 )  # fmt: skip
 @click.option(
     "--strain", "strain_column", metavar="COLUMN",
-    help="Name the column of the strain. The mean of each block is kept as the track of a camera. "
-    "Default: none.",
+    help=f"Name the column of the strain; {OTHER_SIGN}. The mean of each block is kept as the "
+    "track of a camera. Default: none.",
 )  # fmt: skip
 @click.option(
     "--displacement", "displacement_column", metavar="COLUMN",
     help="Name the column of the displacement from the length at zero strain, in m, in place of "
-    "--strain. Default: none.",
+    f"--strain; {OTHER_SIGN}. Default: none.",
 )  # fmt: skip
 @click.option(
     "--length", "length_column", metavar="COLUMN",
@@ -223,6 +229,8 @@ def _length(
             f"A displacement needs the length at zero strain. State it with --zero-length-m. {file}"
         )
     column = named[found[0]]
+    if kind == "length":
+        refuse_other_sign("--length", column, file)
     if kind == "strain":
         _check_ratio(column, file, columns)
     return LengthColumn(column, kind, FIDUCIALS, zero_length_m)

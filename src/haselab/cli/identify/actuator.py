@@ -39,7 +39,7 @@ from haselab.store.session.opening import is_session
 from haselab.store.session.reader import session_file
 from haselab.store.toml import validated
 
-__all__ = ["actuator", "law_of_section", "section_of_fit"]
+__all__ = ["actuator", "each_once", "law_of_section", "section_of_fit"]
 
 _SAME = 1e-3  # largest relative difference of stated numbers that count as equal
 _TABLE_ZERO_M = 5e-5  # standard deviation of the zero of a displacement sensor, set by a caliper
@@ -149,7 +149,8 @@ def actuator(
     section = section_of_fit(fit, records, gains_v_per_v[0])
     proposals = _proposals(tables, section, fit, actuator)
     listed = {"experiments": [proposal.answer() for proposal in proposals]}
-    emit_fit(fit, inputs, as_json, out, listed, _shorter(fit))
+    shorter = {**_shorter(fit), "experiments": each_once(proposals)}
+    emit_fit(fit, inputs, as_json, out, listed, shorter)
     save_plot(plot, fit.chart)
     save_section(actuator, "model.physical", section, inputs, status=fit.status)
 
@@ -238,6 +239,29 @@ def _proposals(
     unknown = [name for name in fit.not_identifiable if planner.before()[name] > DETERMINED]
     found = (planner.propose(name, pairs=False) for name in unknown)
     return [proposal for proposal in found if proposal is not None]
+
+
+def each_once(proposals: Sequence[Proposal]) -> list[JsonObject]:
+    """List each study once, with all parameters for which it is proposed.
+
+    Args:
+        proposals: one for each parameter.
+    Returns:
+        What is printed for each study.
+    """
+    studies: dict[str, list[Proposal]] = {}
+    for proposal in proposals:
+        studies.setdefault(proposal.candidate.text, []).append(proposal)
+    return [
+        {
+            "experiment": text,
+            "duration_s": same[0].duration_s,
+            "relative_std": {proposal.parameter: proposal.change for proposal in same},
+            "study": same[0].candidate.tables,
+            "notes": list(dict.fromkeys(note for proposal in same for note in proposal.notes)),
+        }
+        for text, same in studies.items()
+    ]
 
 
 def _note_assumed(law: ActuatorLaw, section: ActuatorSection | None, path: Path) -> None:

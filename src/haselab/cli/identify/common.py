@@ -75,13 +75,14 @@ _SHORTER = {  # parts of an answer that nobody reads on the screen
 }
 _COPY = 0.9  # share of the samples of a record, above which it is a copy of another one
 
-STRETCH = Quantity("--stretch", ("stretch",), "1", "the stretch")
+STRETCH = Quantity("--stretch", ("stretch",), "1", "the stretch", signed=False)
 VOLTAGE = Quantity("--voltage", ("voltage_v", "voltage"), "V", "the voltage")
 CAPACITANCE = Quantity(
     "--capacitance",
     ("capacitance_f", "capacitance", "relative_capacitance"),
     None,
     "the capacitance, in F or in relative units",
+    signed=False,
 )
 LOAD = Quantity("--load", ("load_n", "load", "force_n", "force"), "N", "the force")
 STRESS = Quantity(

@@ -9,6 +9,7 @@ import click
 from haselab.cli.columns import column_options
 from haselab.cli.common import answer_options
 from haselab.cli.identify.common import FILE, emit_fit, read_valid
+from haselab.cli.options import OTHER_SIGN
 from haselab.cli.plot import save_plot
 from haselab.identify.statics.monotone_map import fit_map
 from haselab.store.columns.selection import ColumnOptions
@@ -20,11 +21,11 @@ __all__ = ["spline_map"]
 @FILE
 @click.option(
     "--x", "abscissa", default="x", show_default=True, metavar="COLUMN",
-    help="Name the column to map from.",
+    help=f"Name the column to map from; {OTHER_SIGN}.",
 )  # fmt: skip
 @click.option(
     "--y", "ordinate", default="y", show_default=True, metavar="COLUMN",
-    help="Name the column to map to.",
+    help=f"Name the column to map to; {OTHER_SIGN}.",
 )  # fmt: skip
 @click.option(
     "--monotone", is_flag=True,

@@ -51,7 +51,11 @@ from haselab.store.columns.selection import ColumnOptions
 __all__ = ["command"]
 
 _NO_BAND = "no uncertainty: the model has no covariance"
-_NO_CURVE = "no uncertainty: the model file has no covariance of the nonlinear curve"
+_NO_CURVE = (
+    "none: a band needs the covariance of the curve (gain_2, gain_3) and of the linear part "
+    "together, but a model file has only that of the linear part. So whether the error is larger "
+    "than the uncertainty was not checked; fit_percent and rms_error are valid"
+)
 _NO_NOISE = (
     "none: the model file does not state residual_std, without which the band would be too narrow. "
     "Identify the model again"

@@ -29,12 +29,20 @@ __all__ = ["command"]
 @click.command("margins")
 @click.argument("model", type=click.Path(path_type=Path))
 @click.option(
-    "--kp", type=REAL, help="Set the proportional gain. Default: that of the actuator file."
-)
+    "--kp", type=REAL,
+    help="Set the proportional gain, in units of the controller's output per unit of its input: "
+    "V/m for a model from V to m, a pure number for one from strain to strain. Default: that of "
+    "the actuator file.",
+)  # fmt: skip
 @click.option(
-    "--ki", type=REAL, help="Set the integral gain in 1/s. Default: that of the actuator file."
-)
-@click.option("--kd", type=REAL, help="Set the derivative gain in s. Default: 0.")
+    "--ki", type=REAL,
+    help="Set the integral gain, in the unit of --kp per second: V/(m s), or 1/s. Default: that of "
+    "the actuator file.",
+)  # fmt: skip
+@click.option(
+    "--kd", type=REAL,
+    help="Set the derivative gain, in the unit of --kp times seconds: V s/m, or s. Default: 0.",
+)  # fmt: skip
 @click.option(
     "--derivative-filter-s", type=REAL,
     help="Set the time constant of the measurement's filter in s. Default: 0.",

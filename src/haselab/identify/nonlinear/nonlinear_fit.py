@@ -11,9 +11,10 @@ from typing import Protocol
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from haselab.base import Estimate, JsonObject, ResultError, checked
+from haselab.base import Estimate, InputError, JsonObject, ResultError, checked
 from haselab.identify.fit import Prediction, RecordFit
 from haselab.identify.noise import fit_percent
+from haselab.identify.nonlinear.input_curve import InputCurve
 from haselab.identify.prediction import note_range
 from haselab.identify.record import Record, finite_vector
 from haselab.identify.residual_tests import input_correlation_p
@@ -70,6 +71,18 @@ class NonlinearFit(TransferFit):
     def records(self) -> tuple[Record, ...]:
         """The experiments."""
         return self.fitted_records
+
+    @property
+    def _linear_records(self) -> tuple[Record, ...]:
+        """The records after the curve of a Hammerstein model, else the experiments."""
+        if not self.kind.startswith("hammerstein"):
+            return self.records
+        factors = [self.parameters[name].value for name in ("gain", *self.curve)]
+        curve = InputCurve(self.operating_input, tuple(each / factors[0] for each in factors))
+        try:
+            return tuple(curve.apply_to(record) for record in self.records)
+        except InputError:  # the curve makes an input constant
+            return self.records
 
     @property
     def parameter_count(self) -> int:

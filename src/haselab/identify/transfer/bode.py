@@ -33,8 +33,9 @@ def bode_panels(
     Args:
         model: the fitted model.
         posterior: with the covariance of its parameters; None: no band is drawn.
-        records: that were fitted. Their frequency response is drawn if it can be estimated: input
-            and output have the same times, and the input varies enough.
+        records: of input and output of the model. Their frequency response is drawn if it can be
+            estimated: input and output have the same times, and the input varies enough; else the
+            legend says that it is missing.
         names: of the axes of input and output, for the unit of the magnitude.
     Returns:
         The panel of the magnitude and that of the phase.
@@ -53,7 +54,10 @@ def bode_panels(
         turns = np.degrees(near + np.angle(lines * np.exp(-1j * near)))
         sizes.append(Curve(hz, np.abs(lines), "measured", "points"))
         phases.append(Curve(hz, turns, "", "points"))
-    sizes.append(Curve(frequency_hz, np.abs(response), "model, 95 %", std=size_std))
+    label = "model" if size_std is None else "model, 95 %"
+    if measured is None:
+        label += " (no measured points: the records do not give a frequency response)"
+    sizes.append(Curve(frequency_hz, np.abs(response), label, std=size_std))
     phases.append(Curve(frequency_hz, np.degrees(phase), std=turn_std))
     return (
         Panel("Frequency (Hz)", size, sizes, log_x=True, log_y=True),

@@ -222,6 +222,11 @@ class TransferFit(RecordFit[Record]):
         """The posterior; None if a parameter is not identifiable."""
         return None if np.isinf(self.covariance).any() else self.posterior
 
+    @property
+    def _linear_records(self) -> tuple[Record, ...]:
+        """Records of input and output of the linear model, for its frequency response."""
+        return self.records
+
     @checked
     def simulate(self, u: ArrayLike, rate_hz: float | None = None) -> Floats:
         """See `RecordFit`."""
@@ -260,7 +265,7 @@ class TransferFit(RecordFit[Record]):
             model = self.rational
         except ResultError:  # a parameter is not identifiable
             return chart
-        bode = bode_panels(model, self._spread, self.records, names)
+        bode = bode_panels(model, self._spread, self._linear_records, names)
         return Chart(title, (*chart.panels, *bode), shared_x=False)
 
     def answer(self) -> JsonObject:

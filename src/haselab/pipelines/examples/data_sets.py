@@ -123,6 +123,33 @@ def _bench() -> dict[str, str]:
     }
 
 
+def _kind(kind: str) -> dict[str, str]:
+    from haselab.rig.chip import source_folder  # the import takes half a second
+
+    folder = source_folder() / "examples" / "kinds" / kind
+    if not folder.is_dir():
+        raise InputError(
+            "This installation of haselab does not contain the example. Install haselab again. "
+            f"{folder}"
+        )
+    return {path.name: path.read_text(encoding="utf-8") for path in sorted(folder.glob("*.toml"))}
+
+
+def _study_of(kind: str, title: str) -> DataSet:
+    """The study of another kind than that of the reference study, with its twin."""
+    return DataSet(
+        kind,
+        f"Study of a {title} on its simulated bench",
+        f"`twin.toml` has the parameters of the {title}, `rig.toml` is the rig file of its "
+        "bench, and `study.toml` plays all experiments. Change them for your own actuator.",
+        lambda: _kind(kind),
+        (
+            "plan feasibility study.toml --rig rig.toml",
+            "run study.toml --rig rig.toml --quick --out run",
+        ),
+    )
+
+
 DATA_SETS: tuple[DataSet, ...] = (
     DataSet(
         "monitors",
@@ -245,6 +272,9 @@ DATA_SETS: tuple[DataSet, ...] = (
             "export twin-hz.toml --to fmu --out twin.fmu",
         ),
     ),
+    _study_of("peano-hasel", "Peano-HASEL"),
+    _study_of("curling-hasel", "curling HASEL"),
+    _study_of("dea-stack", "DEA stack"),
 )
 
 

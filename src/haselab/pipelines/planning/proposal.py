@@ -73,12 +73,17 @@ class Proposal:
         }
 
     @property
+    def change(self) -> str:
+        """The relative standard deviation before and after it, in words."""
+        far = "" if self.after <= self.wanted else " (not enough)"
+        return f"{self.before:.2g} to {self.after:.2g}{far}"
+
+    @property
     def text(self) -> str:
         """One line of a table."""
-        far = "" if self.after <= self.wanted else " (not enough)"
         return (
             f"{self.candidate.text}: {self.duration_s:.0f} s, relative standard deviation "
-            f"{self.before:.2g} to {self.after:.2g}{far}"
+            f"{self.change}"
         )
 
 

@@ -1,4 +1,4 @@
-"""Figure S6: the paper's sensing chain compared with the lock-in."""
+"""Figure 13: the paper's sensing chain compared with the lock-in."""
 
 from __future__ import annotations
 
@@ -36,7 +36,8 @@ def _chain(host: FigureBase, run: RunFolder) -> None:
 
 PLAN = FigurePlan(
     "chain",
-    "Figure S6",
+    "Figure 13",
+    "sensing chain",
     "Capacitance in cycles 2 to 5 of the triangle test, from the lock-in and from the paper's "
     "sensing chain (low-pass, mean of the periods, peak to peak, phase; eqs. 2 and 3), and their "
     "difference. Averaging over periods does not remove the ramp and the steps of the drive.",

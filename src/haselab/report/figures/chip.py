@@ -1,4 +1,4 @@
-"""Figures S4 and S5: the loop on the microcontroller compared with those of the desktop."""
+"""Figures 11 and 12: the loop on the microcontroller compared with those of the desktop."""
 
 from __future__ import annotations
 
@@ -75,7 +75,8 @@ def _played(run: RunFolder, name: str) -> Section:
 
 PLAN = FigurePlan(
     "chip",
-    "Figure S4",
+    "Figure 11",
+    "microcontroller",
     "One step with three loops with the same gains: the desktop at 100 Hz, the desktop at the "
     "microcontroller's rate and delay, and the microcontroller (chip) in co-simulation. As in "
     "figure 6, a triangle was played before the step, unless the figure comes from 'haselab "
@@ -88,7 +89,8 @@ PLAN = FigurePlan(
 )
 MINIATURE = FigurePlan(
     "miniature",
-    "Figure S5",
+    "Figure 12",
+    "miniature bench",
     "The miniature bench: the microcontroller computes phase, strain and controller, and a "
     "commercial supply on a serial line provides the high voltage. The supply reaches half of the "
     "study's voltage, so zero strain and step differ from those of figure 6 (row S28). Mean of the "

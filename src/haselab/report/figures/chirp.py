@@ -1,4 +1,4 @@
-"""Figure S1: Bode plot of the plant from the chirp, and the chirp itself."""
+"""Figure 8: Bode plot of the plant from the chirp, and the chirp itself."""
 
 from __future__ import annotations
 
@@ -77,7 +77,8 @@ def _sweep(host: FigureBase, run: RunFolder) -> None:
 
 PLAN = FigurePlan(
     "bode-plant",
-    "Figure S1",
+    "Figure 8",
+    "plant",
     "Chirp experiment. A: measured frequency response, with one standard deviation as a band, "
     "fitted models, and coherence. B: response to the chirp in time, with those of the models.",
     (

@@ -67,6 +67,7 @@ def _free_response(host: FigureBase, run: RunFolder) -> None:
 PLAN = FigurePlan(
     "fig5",
     "Figure 5",
+    "free response",
     "Free response at the operating voltage: the mass is lifted and dropped. Displacement relative "
     "to the final value of eq. 6: trials (blue, red) with the standard deviation of the three "
     "tracked points as bands, their mean (light blue), eq. 6 as printed (dotted) and with an "

@@ -1,4 +1,4 @@
-"""Figure S7: closed-loop trials in addition to the paper's."""
+"""Figure 14: closed-loop trials in addition to the paper's."""
 
 from __future__ import annotations
 
@@ -55,7 +55,8 @@ def _further(host: FigureBase, run: RunFolder) -> None:
 
 PLAN = FigurePlan(
     "further",
-    "Figure S7",
+    "Figure 14",
+    "further trials",
     "Additional closed-loop trials: strain measured by the camera (blue) and desired strain "
     "(green). From the top: with the paper's sensing chain instead of the lock-in and a larger "
     "carrier; with extra delay, for which the PI gains are reduced if necessary; and with a "

@@ -56,6 +56,7 @@ def _loop(host: FigureBase, run: RunFolder) -> None:
 PLAN = FigurePlan(
     "fig7",
     "Figure 7",
+    "loops",
     "Bode plot of the plant alone (red) and of the loop with each controller (blue: the "
     "reference PI; other colours: further designs), including the delay of the loop. Dots mark the "
     "crossover; grey lines mark 0 dB and −180°.",

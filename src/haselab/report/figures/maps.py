@@ -137,6 +137,7 @@ def _reconstruction(host: FigureBase, run: RunFolder) -> None:
 PLAN = FigurePlan(
     "fig3",
     "Figure 3",
+    "triangle and maps",
     "Voltage, strain and capacitance in the triangle test. A: drive voltage (DAQ output, and the "
     "amplifier's 5 kV per volt), strain from the camera about the operating point (mean and "
     "standard deviation of three points at the lower clamp), capacitance. The first cycle is not "

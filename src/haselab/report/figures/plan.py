@@ -47,7 +47,8 @@ class FigurePlan:
 
     Args:
         name: file name without its ending.
-        label: such as `Figure 3`.
+        label: such as `Figure 3`; figures 2 to 7 are those of the paper.
+        topic: in a few words, for the list of contents.
         caption: what is shown, and how to read it.
         panels: in reading order.
         needs: section of analysis.json without which the report omits the figure; empty: the report
@@ -57,6 +58,7 @@ class FigurePlan:
 
     name: str
     label: str
+    topic: str
     caption: str
     panels: tuple[Panel, ...]
     needs: str = ""

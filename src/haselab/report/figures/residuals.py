@@ -1,4 +1,4 @@
-"""Figure S3: the residuals of the fits."""
+"""Figure 10: the residuals of the fits."""
 
 from __future__ import annotations
 
@@ -117,7 +117,8 @@ def _free_response(host: FigureBase, run: RunFolder) -> None:
 
 PLAN = FigurePlan(
     "residuals",
-    "Figure S3",
+    "Figure 10",
+    "residuals",
     "Residuals, measured minus fitted. A: chirp, for each model; remaining structure shows "
     "dynamics that the model lacks. B: voltage map; the two branches are the hysteresis. C: static "
     "load test. D: free response. Misfit is the smooth part of the residuals, noise the part that "

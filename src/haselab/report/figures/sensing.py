@@ -1,4 +1,4 @@
-"""Figure S2: self-sensed strain compared with the camera."""
+"""Figure 9: self-sensed strain compared with the camera."""
 
 from __future__ import annotations
 
@@ -39,7 +39,8 @@ def _sensing(host: FigureBase, run: RunFolder) -> None:
 
 PLAN = FigurePlan(
     "sensing",
-    "Figure S2",
+    "Figure 9",
+    "self-sensing",
     "Strain sensed by capacitance and strain measured by the camera, and their difference in "
     "percentage points of strain.",
     (Panel("", "Self-sensed and tracked strain", _sensing, wide=True, height_in=3.6),),

@@ -80,6 +80,7 @@ def _static(host: FigureBase, run: RunFolder) -> None:
 PLAN = FigurePlan(
     "fig4",
     "Figure 4",
+    "static load",
     "Static load test. Measured load against stretch (blue), linear regions of a piecewise-linear "
     "fit with the number of segments of lowest BIC (green) and their centres (asterisks); for a "
     "planar HASEL, Arruda-Boyce fit of the shell with the electrodes' spring in parallel (red). "

@@ -85,6 +85,7 @@ def _each_group(host: FigureBase, run: RunFolder) -> None:
 PLAN = FigurePlan(
     "fig6",
     "Figure 6",
+    "steps",
     "Step experiments. The actuator is first driven to zero strain, then the step follows. In "
     "open loop it creeps, so its strain differs from zero before the step and from the desired "
     "strain at the end. A: desired strain (green), and mean of the trials in each mode, measured "

@@ -114,6 +114,7 @@ def _lateral(host: FigureBase, run: RunFolder) -> None:
 PLAN = FigurePlan(
     "fig2",
     "Figure 2",
+    "tracking",
     "Automatic tracking. A: paths of all tracked particles over the first frame, with the "
     "mid-line (white) and the three points picked for the strain (green circles). B: strain of "
     "slices along the length (0 at the fixed clamp, 1 at the load); a horizontal line means a "

@@ -74,7 +74,8 @@ def lateness_check(rig: Rig, daq: DaqConfig) -> Iterator[CheckResult]:
         "close other programs, or use another USB port"
     )
     good, recommended = daq.ahead_blocks >= blocks, {"daq.ahead_blocks": float(blocks)}
-    yield CheckResult("dry", "read latency", found, good, advice, recommended)
+    criterion = f"daq.ahead_blocks of at least {blocks}; the rig file has {daq.ahead_blocks}"
+    yield CheckResult("dry", "read latency", found, good, advice, recommended, criterion)
 
 
 def start_checks(rig: Rig, daq: DaqConfig, step_v: float, probe_v: float) -> Iterator[CheckResult]:
@@ -121,12 +122,14 @@ def start_checks(rig: Rig, daq: DaqConfig, step_v: float, probe_v: float) -> Ite
         found.seen == _STARTS,
         "Wire daq.output to daq.v_monitor, without the amplifier, "
         "and check that these are the right terminals",
+        criterion=f"all {_STARTS}",
     )
     if found.seen < _STARTS:
         return
     blocks, spread = found.late_blocks, found.spread_samples
     late = f"{np.median(found.late_samples):.3g} samples late, {spread:.3g} from first to last"
-    in_step = blocks == 0 and spread <= _SPREAD + _WIRE_S * daq.rate_hz
+    largest = _SPREAD + _WIRE_S * daq.rate_hz
+    in_step = blocks == 0 and spread <= largest
     yield CheckResult(
         "live",
         "starts of the output",
@@ -135,4 +138,5 @@ def start_checks(rig: Rig, daq: DaqConfig, step_v: float, probe_v: float) -> Ite
         "The device puts "
         "outputs out whole blocks late. Raise daq.ahead_blocks, close other programs, or use "
         "another USB port",
+        criterion=f"no whole block late, and at most {largest:.3g} samples from first to last",
     )

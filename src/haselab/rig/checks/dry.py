@@ -110,6 +110,7 @@ def dry_checks(rig: Rig, plan: DryPlan) -> Iterator[CheckResult]:
         f"{len(blocks)} of {shape[0]} x {shape[1]} readings",
         all(b.shape == (d.block_samples, 2) for b in blocks),
         "Change daq.block_samples",
+        criterion=f"each of {d.block_samples} x 2 readings",
     )
     gap_s = took_s - _BLOCKS * d.block_s
     yield CheckResult(
@@ -118,6 +119,7 @@ def dry_checks(rig: Rig, plan: DryPlan) -> Iterator[CheckResult]:
         f"{abs(1e3 * gap_s):.3f} ms between blocks",
         abs(gap_s) < 0.5 / d.rate_hz,
         "Close other programs",
+        criterion=f"below {0.5e3 / d.rate_hz:.3g} ms, half a sample",
     )
     if plan.real_time:
         share = took_s / wall_s - 1.0
@@ -127,6 +129,7 @@ def dry_checks(rig: Rig, plan: DryPlan) -> Iterator[CheckResult]:
             f"{100.0 * share:+.2g} % against the computer's",
             abs(share) < _CLOCK_SHARE,
             "The samples do not come at daq.rate_hz. Change it, or close other programs",
+            criterion=f"within {100.0 * _CLOCK_SHARE:g} %",
         )
     if plan.daq is not None:
         yield from lateness_check(rig, plan.daq)
@@ -158,13 +161,19 @@ def _see_monitors(rig: Rig, codes: NDArray[np.int16]) -> Iterator[CheckResult]:
             )
         elif abs(at_rest_v) >= quiet_v:
             advice = _OFFSET
-        yield CheckResult("dry", what, found, not advice, advice)
+        criterion = (
+            f"noise, inside the range, and a mean of at most {quiet_v:.3g} V at the input; here "
+            f"{at_rest_v:.2g} V"
+        )
+        yield CheckResult("dry", what, found, not advice, advice, criterion=criterion)
     for k, what in enumerate(("voltage monitor", "current monitor")):
         hum_hz, hum_v = _mains(at_input[:, k], rig.description.rate_hz)
         if hum_v > (quiet_at_input_v(rig), _CURRENT_OFFSET_V)[k]:
+            quiet_v = (quiet_at_input_v(rig), _CURRENT_OFFSET_V)[k]
             yield CheckResult(
-                "dry", f"mains at the {what}", f"{hum_v:.2g} V at {hum_hz:g} Hz", False, _HUM
-            )
+                "dry", f"mains at the {what}", f"{hum_v:.2g} V at {hum_hz:g} Hz", False, _HUM,
+                criterion=f"at most {quiet_v:.3g} V at the input",
+            )  # fmt: skip
 
 
 def quiet_at_input_v(rig: Rig) -> float:
@@ -227,7 +236,10 @@ def _see_frames(rig: Rig, wanted_hz: float | None) -> Iterator[CheckResult]:
         reported += f", {known.dropped} lost, times to {_duration(known.uncertainty_s)}"
         good = good and known.dropped == 0
     lost = known is not None and known.dropped > 0
-    yield CheckResult("dry", "frames", reported, good, _LINK if lost else _SLOW)
+    criterion = f"rising times, the rate within {100.0 * _RATE_SHARE:g} %"
+    criterion += "" if known is None else ", no lost frame"
+    advice = _LINK if lost else _SLOW
+    yield CheckResult("dry", "frames", reported, good, advice, criterion=criterion)
     if isinstance(rig.camera, ReportsRemarks):
         yield from (CheckResult("dry", "camera", remark, True) for remark in rig.camera.remarks)
 
@@ -268,6 +280,7 @@ def read_backs(rig: Rig, step: str) -> Iterator[CheckResult]:
             f"{measured_v:.3g} V read back",
             abs(measured_v) < QUIET_SHARE * span_v(rig),
             "Switch the amplifier off by hand, then find what else drives its input",
+            criterion=f"below {QUIET_SHARE * span_v(rig):.3g} V",
         )
     if isinstance(rig.generator, ReportsOutputState):
         off = rig.generator.is_off()
@@ -277,6 +290,7 @@ def read_backs(rig: Rig, step: str) -> Iterator[CheckResult]:
             "off" if off else "on",
             off,
             "Switch its output off at the front panel",
+            criterion="off, as the instrument reports",
         )
     if isinstance(rig.supply, ChecksPower):
         rig.supply.check_power()
@@ -285,6 +299,8 @@ def read_backs(rig: Rig, step: str) -> Iterator[CheckResult]:
         off = (
             rig.supply.is_off() if isinstance(rig.supply, ReportsOutputState) else measured_v == 0.0
         )
+        reports = isinstance(rig.supply, ReportsOutputState)
         yield CheckResult(
-            step, "supply off", f"{measured_v:g} V", off, "Pull the supply's power jack"
-        )
+            step, "supply off", f"{measured_v:g} V", off, "Pull the supply's power jack",
+            criterion="off, as the instrument reports" if reports else "0 V",
+        )  # fmt: skip

@@ -72,6 +72,7 @@ def edge_check(
         f"frames arrive {found} of exposure: the edge {'begins' if begins else 'ends'} it",
         bool(begins),
         _SWITCH,
+        criterion="the edge begins the exposure: the lag does not depend on the exposure time",
     )
 
 

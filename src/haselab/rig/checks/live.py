@@ -15,7 +15,7 @@ from haselab.rig.check_result import CheckResult
 from haselab.rig.checks.board import start_checks
 from haselab.rig.checks.dry import QUIET_SHARE, read_backs
 from haselab.rig.checks.signals import input_volts, keep, phasor, saturated, span_v, volts
-from haselab.rig.checks.wires import Expected, Seen, capacitance_f, diagnose
+from haselab.rig.checks.wires import CRITERION, Expected, Seen, capacitance_f, diagnose
 from haselab.rig.instruments.sections import DaqConfig
 
 __all__ = ["CARRIER_V", "SUPPLY_V", "LivePlan", "live_checks", "live_step_v"]
@@ -126,6 +126,7 @@ def _see_supply(supply: HighVoltageSupply, wanted_v: float) -> Iterator[CheckRes
         abs(measured_v - wanted_v) < near_v,
         "Plug in its power, switch its main switch on, "
         "and calibrate it; check that the load does not draw too much current",
+        criterion=f"within {near_v:g} V, after at most {_SUPPLY_S:g} s",
     )
     yield CheckResult(
         "live",
@@ -133,6 +134,7 @@ def _see_supply(supply: HighVoltageSupply, wanted_v: float) -> Iterator[CheckRes
         f"{left_v:g} V, within {_SUPPLY_S:g} s of switching it off",
         abs(left_v) < near_v,
         "Pull its power jack, because it does not switch off. Have the output switch repaired",
+        criterion=f"below {near_v:g} V",
     )
 
 
@@ -160,6 +162,7 @@ def _see_loop(rig: Rig, controller: BuiltInController) -> CheckResult:
         f"{drive_v:.3g} V of drive at a strain of {wanted:g}",
         0.0 < drive_v < rig.description.drive_limits.high,
         "Calibrate the microcontroller again, and check its wiring",
+        criterion=f"above 0 and below {rig.description.drive_limits.high:g} V",
     )
 
 
@@ -174,6 +177,7 @@ def _see_capacitor(controller: BuiltInController, known_f: float) -> CheckResult
         abs(farad / known_f - 1.0) <= _KNOWN_SHARE,
         f"If the capacitor is right, {factor}, build the firmware again with 'haselab firmware "
         "build RUN --rig' and this rig file, and flash it",
+        criterion=f"within {100.0 * _KNOWN_SHARE:g} %",
     )
 
 
@@ -213,11 +217,13 @@ def _see_wires(rig: Rig, plan: LivePlan) -> Iterator[CheckResult]:
         change = _step(rig, probe_v).change_v
         named = diagnose(Seen(v_carrier, i_carrier, *change.tolist()), expected)
         what, advice = named or ("correct on the second try", "Run the check again")
-        yield CheckResult("live", "sensing signal", f"{found}: {what}", False, advice)
+        yield CheckResult(
+            "live", "sensing signal", f"{found}: {what}", False, advice, criterion=CRITERION
+        )
         return
     if plan.capacitor_f is None:
         found += ", current scale not checked (use --capacitor)"
-    yield CheckResult("live", "sensing signal", found, True)
+    yield CheckResult("live", "sensing signal", found, True, criterion=CRITERION)
     plan.alive()
     yield from _see_step(rig, v_carrier, i_carrier)
     if plan.capacitor_f is not None:
@@ -342,6 +348,7 @@ def _see_step(rig: Rig, v_carrier: complex, i_carrier: complex) -> Iterator[Chec
         f"sample {at}, the rig file says {d.switch_sample}",
         0 <= at - d.switch_sample < settle,
         advice,
+        criterion=f"0 to {settle - 1} samples later",
     )
     # The monitor's own offset is not part of the step.
     reached_v = v_step / d.monitor_v_per_drive_v
@@ -353,6 +360,7 @@ def _see_step(rig: Rig, v_carrier: complex, i_carrier: complex) -> Iterator[Chec
         "Change amplifier.gain, "
         "amplifier.volt_per_monitor_volt or the gain of the summing stage, or calibrate "
         "the monitor",
+        criterion=f"within {100.0 * _STEP_TOLERANCE:g} %",
     )
     yield CheckResult(
         "live",
@@ -360,6 +368,7 @@ def _see_step(rig: Rig, v_carrier: complex, i_carrier: complex) -> Iterator[Chec
         f"{left_v:.3g} V in the next block",
         abs(left_v) < QUIET_SHARE * span_v(rig),
         "Switch the amplifier off by hand, then find what else drives its input",
+        criterion=f"below {QUIET_SHARE * span_v(rig):.3g} V",
     )
 
 
@@ -381,4 +390,5 @@ def _known(farad: float, known_f: float, rig: Rig) -> CheckResult:
         f"Multiply amplifier.ampere_per_monitor_volt by {1.0 / ratio:.3g}, which gives "
         f"{1.0 / (rig.description.i_monitor_v_per_a * ratio):.3g} A/V; or change "
         "volt_per_monitor_volt, if a voltmeter at the monitor confirms that",
+        criterion=f"{1e12 * low_f:.4g} to {1e12 * high_f:.4g} pF, with cable and fixture",
     )

@@ -6,7 +6,7 @@ import cmath
 import math
 from dataclasses import dataclass
 
-__all__ = ["Expected", "Seen", "capacitance_f", "diagnose"]
+__all__ = ["CRITERION", "Expected", "Seen", "capacitance_f", "diagnose"]
 
 _NOTHING = 0.1  # fraction of the expected signal below which there is none
 _ALIKE = 0.25  # two factors that differ by less have one cause, if both are far from 1
@@ -18,6 +18,10 @@ _LARGE_A = 2e-3  # at 100 V and 2 kHz: 1.6 nF
 _LEAST_F = 3e-12  # open leads
 _HALF, _DOUBLE = (0.45, 0.55), (1.8, 2.2)  # ratios if the generator's 50 ohm load setting is wrong
 _RIGHT_ANGLE_DEG = 20.0  # largest deviation of the current's phase from 90 degrees
+CRITERION = (
+    f"{1.0 - _SCALE:g} to {1.0 + _SCALE:g} times the expected amplitude, a current of at least "
+    f"{1e12 * _LEAST_F:g} pF that leads by 90 ± {_RIGHT_ANGLE_DEG:g} degrees"
+)
 
 
 @dataclass(frozen=True)

@@ -267,9 +267,19 @@ class Archive(Closing, ABC):
     def locate(self, name: str) -> str | None:
         """The full name of a column: given in full, as its end, or without its unit.
 
+        A minus before the name asks for the same column with the other sign.
+
         Raises:
             InputError: several columns fit.
         """
+        found = self._locate(name)
+        return self._locate(name[1:].lstrip()) if found is None and name[:1] == "-" else found
+
+    def is_negative(self, name: str) -> bool:
+        """Whether a name asks for the other sign, as "-Weg" does unless a column is called so."""
+        return name[:1] == "-" and self._locate(name) is None
+
+    def _locate(self, name: str) -> str | None:
         if name in self.names:
             return name
         full = [other for other in self.names if other.rpartition("/")[2] == name]

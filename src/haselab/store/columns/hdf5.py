@@ -178,9 +178,8 @@ class Hdf5Archive(MemberArchive):
         if isinstance(link, h5py.ExternalLink):
             self._elsewhere.append(name)
 
-    def locate(self, name: str) -> str | None:
-        """The full name of a column; one that lies in another file is refused."""
-        found = super().locate(name)
+    def _locate(self, name: str) -> str | None:
+        found = super()._locate(name)
         if found is None:
             linked = [
                 other for other in self._elsewhere if name in (other, other.rpartition("/")[2])

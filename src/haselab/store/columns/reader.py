@@ -41,6 +41,7 @@ __all__ = [
 _HEAD_ROWS = 4096
 _HDF5, _MAT_HEADER_BYTES = b"\x89HDF\r\n\x1a\n", 512
 _UNITS_OF_TIME = {"ms": 1e3, "us": 1e6}  # per second
+_NEVER_NEGATIVE = {"F": "a capacitance", "kg": "a mass", "Hz": "a frequency", "Ω": "a resistance"}
 _EVEN = 0.01  # of a step: how far times may be from even ones
 
 _TEXT_ENDINGS = (".csv", ".txt", ".tsv", ".tab", ".dat", ".asc", ".lvm", ".prn")
@@ -238,6 +239,7 @@ class ColumnStream(Closing):
     ) -> None:
         self._archive, self._options = archive, options
         self._names = archive.locate_all(names)
+        self._negative = [archive.is_negative(name) for name in names]
         if len(names) > 1 and len(set(self._names)) < len(names):
             raise InputError(
                 f"Column {self._names[0]} is named for two quantities. Name another column for one "
@@ -250,6 +252,12 @@ class ColumnStream(Closing):
                     f"{', '.join(archive.names)}: {archive.file}"
                 )
         self.units = [stated_unit(archive, name, options) for name in self._names]
+        for name, unit, negative in zip(names, self.units, self._negative, strict=True):
+            if negative and unit is not None and unit.si in _NEVER_NEGATIVE:
+                raise InputError(
+                    f"Column {name} asks for the other sign, but {_NEVER_NEGATIVE[unit.si]} cannot "
+                    f"be negative. Name it without the minus: {archive.file}"
+                )
         self._times: str | None = None
         self.assumed_seconds = ""  # column of times whose unit nobody states
         self._time_factor = 1.0
@@ -364,7 +372,7 @@ class ColumnStream(Closing):
                 self._check_times(time_s, last_s)
                 last_s = float(time_s[-1])
             self.rows_read += count
-            yield tuple(map(_in_si, arrays, self.units))
+            yield tuple(map(_in_si, arrays, self.units, self._negative))
             if count < rows:
                 break
         if self.rows_read == 0:
@@ -436,12 +444,13 @@ def head_of_times(
         InputError: the column that the options name is missing or does not contain numbers.
     """
     with open_archive(path) as archive:
-        name = time_column(archive, options, beside=archive.locate_all(names))
+        beside = archive.locate_all(names)
+        name = time_column(archive, options, beside=beside)
         if name is None:
             return None
         unit = stated_unit(archive, name, options)
         try:
-            archive.rows([*names, name])
+            archive.rows([*beside, name])
             (values,) = archive.start([name])(rows)
         except InputError:
             if options.time is not None or name == "time_s":
@@ -450,11 +459,12 @@ def head_of_times(
     return name, values.astype(np.float64) * (1.0 if unit is None else unit.factor)
 
 
-def _in_si(values: NDArray[Any], unit: Unit | None) -> NDArray[Any]:
+def _in_si(values: NDArray[Any], unit: Unit | None, negative: bool) -> NDArray[Any]:
     """Values of a column in the SI unit, not copied where they are."""
-    if unit is None or unit.factor == 1.0:
+    factor = (1.0 if unit is None else unit.factor) * (-1.0 if negative else 1.0)
+    if factor == 1.0:
         return values
-    return np.asarray(values * np.float64(unit.factor), dtype=np.float64)
+    return np.asarray(values * np.float64(factor), dtype=np.float64)
 
 
 def open_columns(
@@ -472,9 +482,10 @@ def open_columns(
     Args:
         path: text tables (`.csv`, `.txt`, `.lvm` and others), `.mat` (v5 and v7.3), `.npz`,
             `.npy`, `.h5`, `.hdf5` or `.tdms`.
-        names: wanted columns, with or without the unit in their names; in text tables also their
-            numbers from 1 on; for HDF5, LabVIEW and structures also `group/name`. An array of
-            shape `(n, 2)` or `(2, n)` in a `.npy` has no names: its columns are the two wanted.
+        names: wanted columns, with or without the unit in their names, with a minus before the name
+            for the other sign; in text tables also their numbers from 1 on; for HDF5, LabVIEW and
+            structures also `group/name`. An array of shape `(n, 2)` or `(2, n)` in a `.npy` has no
+            names: its columns are the two wanted.
         use_times: take the rate from the column of times where nothing else states it.
         options: the column of times, and units, where the file does not state them.
     Returns:

@@ -89,10 +89,15 @@ def time_column(
     Returns:
         The name; None where there is none.
     Raises:
-        InputError: the column that the options name is missing or has no times.
+        InputError: the column that the options name is missing or has no times, or has a minus.
     """
     if options.time is not None:
         (full,) = archive.locate_all([options.time])
+        if archive.is_negative(options.time):
+            raise InputError(
+                f"--time {options.time} asks for times with the other sign, which would fall. "
+                f"Name the column without the minus: {archive.file}"
+            )
         unit = stated_unit(archive, full, options)
         if unit is not None and unit.si != "s":
             raise InputError(

@@ -48,7 +48,7 @@ def further_trials(
     study: Study,
     scale_m_per_px: float,
 ) -> ExperimentResult:
-    """Results S10, S22 and S24 of the further trials, and data for figure S7.
+    """Results S10, S22 and S24 of the further trials, and data for figure 14.
 
     Args:
         observed: by group, `printed`, `late` and `saturating`; groups without trials are left out.

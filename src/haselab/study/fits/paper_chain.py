@@ -102,7 +102,7 @@ def compare_chain(
         periods: of the carrier in a block.
         fitted_periods: of these, how many the lock-in fits.
     Returns:
-        Results S6 to S8, data for figure S6.
+        Results S6 to S8, data for figure 13.
     Raises:
         ResultError: fewer than 16 blocks have both values.
     """

@@ -64,4 +64,5 @@ class NidaqInstrument(DaqInstrument[NidaqConfig]):
                 row.fault.rstrip(".") or found,
                 row.ok,
                 recommended=recommended,
+                criterion="the board accepts the task",
             )

@@ -139,7 +139,9 @@ class ServedTwin(Closing):
         """
         config, serial = self._config, f"{self.daq.serial_number:08X}"
         acquisition, amplifier, law = config.acquisition, config.amplifier, config.law
-        width_m = law.width_m / law.lateral_stretch
+        # Rounded to the digits of a product: 3 * 0.0498 / 3 is 0.04979999999999999.
+        width_m = float(f"{law.width_m / law.lateral_stretch:.12g}")
+        thickness_m = float(f"{law.area_m2 / width_m:.12g}")
         return f"""# A served twin, used through the drivers of the real instruments.
 kind = "bench"
 name = "{config.name} over the wire"
@@ -176,7 +178,7 @@ highest_v = 5000.0
 
 [specimen]
 shell_width_m = {width_m!r}
-shell_thickness_m = {law.area_m2 / width_m!r}
+shell_thickness_m = {thickness_m!r}
 lateral_stretch = {law.lateral_stretch!r}
 mass_kg = {config.load.mass_kg!r}
 

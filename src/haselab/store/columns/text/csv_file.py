@@ -71,8 +71,7 @@ class CsvArchive(Archive):
         """Cells of the header; `column 3` for an empty cell, `U (column 3)` for a repeated one."""
         return self._names
 
-    def locate(self, name: str) -> str | None:
-        """The column of this name or number."""
+    def _locate(self, name: str) -> str | None:
         if name in self._names:
             return name
         same = [k for k, cell in enumerate(self._layout.names) if cell == name]

@@ -1,33 +1,18 @@
-"""The summary at the top of the page: the main numbers in one paragraph."""
+"""The summary at the top of the page: agreement with the paper and what is missing."""
 
 from __future__ import annotations
 
-import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 
-from haselab.report.numbers import value_text
 from haselab.report.results import VERDICTS, Quantity, Results
 
 __all__ = ["counted", "summary_text", "verdict_counts"]
 
-_MAIN = (
-    ("S20.omega_n", "The natural frequency of the fast mode is {}"),
-    ("S20.zeta", "its damping ratio is {}"),
-    ("S25.rise_own", "the rise time with the controller {kind} is {}"),
-    ("S25.overshoot_own", "the overshoot with the controller {kind} is {}"),
-    ("S25.error_own", "the final error with the controller {kind} is {}"),
-    ("S24.rise_open", "the open-loop rise time is {}"),
-    ("S24.rise_closed", "the closed-loop rise time is {}"),
-    ("S24.error_open", "the open-loop final error is {}"),
-    ("S24.error_closed", "the closed-loop final error is {}"),
-    ("S26.rise", "on the microcontroller the rise time is {}"),
-    ("S26.error", "its final error is {}"),
-)
 _MANY = {"agrees": "agree", "disagrees": "disagree"}
 
 
 def summary_text(results: Results) -> str:
-    """Summarise the main numbers, the agreement with the paper and the noise-free comparison.
+    """Summarise the number of results, the agreement with the paper and the noise-free comparison.
 
     Args:
         results: checked content of results.json.
@@ -42,14 +27,7 @@ def summary_text(results: Results) -> str:
     rows = results.quantities
     if not rows:
         return "The folder contains no results."
-    found = [(results.get(identifier), text) for identifier, text in _MAIN]
-    kind = _own_kind(results)
-    clauses = [
-        text.format(_in_words(row), kind=kind)
-        for row, text in found
-        if row and row.measured and not math.isnan(row.measured.value)
-    ]
-    sentences = ["; ".join(clauses)] if clauses else []
+    sentences = [f"{counted(len(rows), 'result', 'results')}, by subject below"]
     if any(row.paper is not None for row in rows):
         sentences.append(_verdicts(rows, results.simulated))
     known = [row.noise_free_inside for row in rows if row.noise_free_inside is not None]
@@ -59,23 +37,9 @@ def summary_text(results: Results) -> str:
         missing = sum(len(ids) for ids, _ in results.not_played)
         sentences.append(
             f"{counted(missing, 'result is', 'results are')} missing, for the reasons listed below "
-            "the table of results"
+            "the other results"
         )
     return " ".join(sentence[0].upper() + sentence[1:] + "." for sentence in sentences)
-
-
-def _own_kind(results: Results) -> str:
-    """The kind of the study's own controller, in quotation marks."""
-    study = results.provenance.get("study")
-    control = study.get("control") if isinstance(study, Mapping) else None
-    kind = control.get("kind") if isinstance(control, Mapping) else None
-    return f"'{kind}'" if kind else "of [control] kind"
-
-
-def _in_words(row: Quantity) -> str:
-    unit = f" {row.unit}" if row.unit else ""
-    paper = f", paper {value_text(row.paper)}{unit}" if row.paper is not None else ""
-    return f"{row.measured_text}{unit} (95 % interval {row.interval_text}{paper})"
 
 
 def _verdicts(rows: Sequence[Quantity], simulated: bool) -> str:

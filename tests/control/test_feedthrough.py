@@ -152,3 +152,32 @@ def test_impossible_shares_are_refused() -> None:
     integrating = RationalModel((1.0,), (1.0, 1.0, 0.0))
     with pytest.raises(InputError, match="the model integrates"):
         loop_margins(integrating, _GAINS, LoopSetting(feedthrough=0.5))
+
+
+@pytest.mark.parametrize("delay_s", [0.0021, 0.00565, 0.0083])
+@pytest.mark.parametrize("share", [0.4, 0.7, 0.86])
+def test_the_delay_margin_is_where_the_simulated_loop_starts_to_oscillate(
+    delay_s: float, share: float
+) -> None:
+    """An added delay turns the phase, and moves the feedthrough by a whole update at a jump."""
+    plant, gains = Plant(1.0, 63.9, 0.76), PidGains(0.0, 116.4)
+    setting = LoopSetting(measurement_delay_s=delay_s, feedthrough=share)
+    found = loop_margins(plant, gains, setting)
+    general = loop_margins(RationalModel.from_plant(plant), gains, setting)
+    assert found.stable
+    by_phase_s = min(
+        np.radians(one.phase_margin_deg) % (2.0 * np.pi) / one.omega_rad_s
+        for one in found.crossovers
+    )
+    assert general.delay_margin_s == pytest.approx(found.delay_margin_s, rel=1e-6)
+    wide = replace(setting.saturation, low=-1e30, high=1e30)
+    swings = []
+    for added_s in (0.9 * found.delay_margin_s, 1.1 * found.delay_margin_s):
+        late = replace(setting, measurement_delay_s=delay_s + added_s, saturation=wide)
+        measured = simulate_loop(plant, gains, [1e-3] * 2000, late).measured
+        swings.append([np.ptp(part) for part in (measured[300:500], measured[1500:1700])])
+    (before, after), (grown_before, grown_after) = swings
+    assert after <= before
+    assert found.delay_margin_s <= by_phase_s
+    if found.delay_margin_s < 0.99 * by_phase_s:  # else the search ends before it is unstable
+        assert grown_after > grown_before

@@ -17,6 +17,7 @@ __all__ = ["feedthrough_doubt", "with_feedthrough", "with_measured_feedthrough"]
 
 _STRAINS = 9  # within the limits of the loop
 _TWO_STD = 2.0
+_SAME = 1e-6  # relative difference of capacitances by rounding
 _HIGH_V = 3000.0  # at which a capacitance that depends on the voltage differs from that at 0 V
 
 
@@ -81,7 +82,8 @@ def feedthrough_doubt(setting: LoopSetting, tables: ActuatorTables) -> str:
     except InputError:  # a kind that is not installed
         return ""
     at = 0.5 * (law.length_limits_m.low + law.length_limits_m.high)
-    if np.ptp(law.differential_capacitance_f(at, np.array([0.0, _HIGH_V]))) == 0.0:
+    ends_f = law.differential_capacitance_f(at, np.array([0.0, _HIGH_V]))
+    if np.ptp(ends_f) < _SAME * ends_f.max():
         return ""
     return (
         f"the capacitance of a {law.kind} depends on the voltage too, so its sensed strain follows "

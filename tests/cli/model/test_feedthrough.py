@@ -138,3 +138,12 @@ def test_the_share_of_a_physical_model_is_that_of_its_limits() -> None:
         "model": {"physical": physical | {"status": "model error"}},
     })  # fmt: skip
     assert with_feedthrough(setting, bad) == setting
+
+
+@pytest.mark.parametrize("kind", ["planar-hasel", "dea-stack", "peano-hasel", "curling-hasel"])
+def test_only_kinds_with_pouches_ask_for_their_feedthrough(tmp_path: Path, kind: str) -> None:
+    path = tmp_path / "actuator.toml"
+    path.write_text(f'[actuator]\nkind = "{kind}"\n' + _MODEL + _MAP, encoding="utf-8")
+    found = CliRunner().invoke(cli, ["margins", str(path), *_GAINS, "--json"])
+    asked = "follows the drive in part at once" in found.stderr
+    assert asked == (kind in ("peano-hasel", "curling-hasel"))

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -14,11 +14,16 @@ from haselab.base import LimitError
 from haselab.control.gains import PidGains
 from haselab.control.linear import LinearController
 from haselab.control.plants.general import AnyPlant, corners_of, sampled_response_of
+from haselab.control.plants.general_loops import closed_loop_poles
+from haselab.control.plants.modes import SampledLoops
 from haselab.control.simulate import LoopSetting
 from haselab.control.stability.encirclement import unstable_poles
 from haselab.models.rational import RationalModel
 
 __all__ = ["Crossover", "Margins", "frequency_grid", "loop_margins", "loop_response", "margins"]
+_LONGEST_SEARCH, _STEPS_PER_UPDATE = 20, 4  # updates of added delay; tries in each
+_JUST_AFTER = 1e-4  # of an update
+_POLE_ERROR, _COARSE = 1e-9, 1500
 _LEAST_DAMPING = 1e-6  # for the width of the grid near a resonance
 _MOST_TURNS = 20_000
 _MOST_STEPS = 100  # iterations for one root
@@ -233,6 +238,13 @@ def margins(
         (math.radians(c.phase_margin_deg) % (2.0 * math.pi) / c.omega_rad_s for c in crossovers),
         default=math.inf,
     )
+    if stable and rate_hz is not None and _passes_steps(plant, feedthrough):
+
+        def stays(added_s: float) -> bool:
+            later = replace(plant, delay_s=plant.delay_s + added_s)
+            return _is_stable(later, gains, loop_delay_s, rate_hz, feedthrough)
+
+        delay = _first_unstable_s(stays, plant.delay_s + loop_delay_s, 1.0 / rate_hz, delay)
     return Margins(
         stable=stable,
         unstable_poles=unstable,
@@ -244,6 +256,77 @@ def margins(
         peak_sensitivity_rad_s=peak_at,
         crossovers=crossovers,
     )
+
+
+def _passes_steps(plant: AnyPlant, feedthrough: float) -> bool:
+    """Whether a part of the measurement jumps with the drive, so its delay is whole updates.
+
+    An added delay then does not only turn the phase.
+    """
+    proper = isinstance(plant, RationalModel) and len(plant.numerator) == len(plant.denominator)
+    return feedthrough != 0.0 or proper
+
+
+def _is_stable(
+    plant: AnyPlant,
+    gains: PidGains | LinearController,
+    loop_delay_s: float,
+    rate_hz: float,
+    feedthrough: float,
+) -> bool:
+    """Whether a sampled loop is stable: by its poles, or by encirclements."""
+    if isinstance(gains, PidGains):
+        if isinstance(plant, RationalModel):
+            setting = LoopSetting(rate_hz, loop_delay_s, feedthrough=feedthrough)
+            poles = closed_loop_poles(plant, [gains], setting)[0]
+        else:
+            loops = SampledLoops.of(
+                [plant], [gains], period_s=1.0 / rate_hz, measurement_delay_s=loop_delay_s,
+                feedthrough=feedthrough,
+            )  # fmt: skip
+            poles = loops.poles()[0]
+        return float(np.abs(poles).max()) <= 1.0 + _POLE_ERROR
+
+    def response(omega: ArrayLike) -> NDArray[np.complex128]:
+        return loop_response(
+            plant, gains, omega, loop_delay_s=loop_delay_s, rate_hz=rate_hz, feedthrough=feedthrough
+        )
+
+    omega = frequency_grid(plant, gains, rate_hz, _COARSE)
+    loop = response(omega)
+    good = np.isfinite(loop)
+    count = unstable_poles(
+        response, omega[good], loop[good], plant=plant, gains=gains, rate_hz=rate_hz
+    )
+    return count == 0
+
+
+def _first_unstable_s(
+    stays: Callable[[float], bool], delay_s: float, period_s: float, by_phase_s: float
+) -> float:
+    """The smallest added delay that makes a loop unstable; `by_phase_s` if none up to it does.
+
+    Args:
+        stays: whether the loop is stable with an added delay.
+        delay_s: of the loop.
+        period_s: of the loop.
+        by_phase_s: delay margin if an added delay only turned the phase.
+    """
+    last_s = min(by_phase_s, _LONGEST_SEARCH * period_s)
+    jumps = period_s * (np.arange(_LONGEST_SEARCH) + 1 + math.floor(delay_s / period_s)) - delay_s
+    steps = period_s / _STEPS_PER_UPDATE * np.arange(1, _LONGEST_SEARCH * _STEPS_PER_UPDATE + 1)
+    tried = np.unique(np.r_[steps, jumps + _JUST_AFTER * period_s])
+    low = 0.0
+    for high in tried[(tried > 0.0) & (tried <= last_s)].tolist():
+        if not stays(high):
+            break
+        low = high
+    else:
+        return by_phase_s
+    while high - low > _JUST_AFTER * period_s:
+        middle = 0.5 * (low + high)
+        low, high = (middle, high) if stays(middle) else (low, middle)
+    return float(low)
 
 
 def loop_margins(

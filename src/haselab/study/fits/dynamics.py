@@ -115,6 +115,12 @@ def fit_chirp_and_steps(
     sweep = _record(chirp, maps, rig, 0.0)
     printed = _second_order(sweep, None if near is None else near.second_order)
     fast = printed.parameters
+    for name in ("natural_frequency_rad_s", "damping_ratio"):
+        if not np.isfinite(fast[name].value):
+            raise ResultError(
+                f"The chirp up to {study.chirp.stop_hz:g} Hz does not determine {name}. Use a "
+                "higher stop_hz or a larger amplitude_v in [chirp]."
+            )
     trials = [_record(s, maps, rig, study.steps.zero_s - _BEFORE_STEP_S) for s in steps]
     slow = _checked(
         fit_transfer(

@@ -181,3 +181,16 @@ def test_a_law_too_sharp_for_the_table_is_refused():
     stiff = dataclasses.replace(PeanoHasel(), rounding_m=5e-6)
     with pytest.raises(InputError, match=r"interpolation between 1024 lengths has a relative er"):
         law_table(stiff, 1.5e4)
+
+
+@pytest.mark.parametrize(
+    ("pouch_mm", "electrode_mm"), [(14, 6), (16, 8), (18, 4), (28, 12), (30, 4)]
+)
+def test_a_pouch_of_usual_dimensions_can_be_sampled_up_to_20_kilovolts(pouch_mm, electrode_mm):
+    """At 16 and 8 mm, a search for the zipped length once ended with all of it zipped."""
+    law = PeanoHasel(pouch_length_m=1e-3 * pouch_mm, electrode_length_m=1e-3 * electrode_mm)
+    table = law_table(law, 20e3)
+    # Zipped films are at most the electrode, which no voltage zips to its end.
+    rise = np.diff(table.capacitance_f, axis=0)
+    assert (rise[1:] > 0.0).all()
+    assert np.abs(np.diff(table.capacitance_f, 4, axis=0)).max() < 5e-3 * table.capacitance_f.max()

@@ -233,7 +233,7 @@ def test_a_share_out_of_reach_is_a_shortfall_with_the_best_one():
 
 
 def test_a_negative_static_gain_is_refused_as_without_a_posterior():
-    with pytest.raises(InputError, match="Negate the input column and identify again"):
+    with pytest.raises(InputError, match="with a minus before the name of the output column"):
         design_controller(
             posterior((-1.0, 32.1, 0.12, 0.012)), SPEC, SETTING, rng=np.random.default_rng(1)
         )

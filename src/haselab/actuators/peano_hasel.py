@@ -395,7 +395,9 @@ class PeanoHasel(ActuatorLaw):
             low[left] = np.where(longer, at, low[left])
             high[left] = np.where(longer, high[left], at)
             inside = (low[left] < new) & (new < high[left]) & (balance.possible | slack)
-            close = np.abs(new - at) <= _CLOSE * np.abs(at)
+            # where all electrodes are zipped the step is 0 without being near a solution
+            left_over = balance.zipped_m < self.electrode_length_m
+            close = left_over & (np.abs(new - at) <= _CLOSE * np.abs(at))
             y[left] = np.where(inside, new, 0.5 * (low[left] + high[left]))
             halved = high[left] - low[left] <= _CLOSEST * np.abs(at)
             y[left[close]] = new[close]

@@ -333,8 +333,10 @@ def _positive(plant: AnyPlant) -> None:
         if gain < 0.0:
             raise InputError(
                 f"plant {what} = {gain:g}; it must be above 0, as the controller gains are. "
-                "Negate the input column and identify again (the model then has a gain above 0), "
-                "give --limits as -HIGH -LOW, and negate the controller's output on the bench."
+                "If the sensor reads less while the actuator lengthens, identify again with a "
+                "minus before the name of the output column. If the input has the other sign, put "
+                "the minus before its column, give --limits as -HIGH -LOW, and negate the "
+                "controller's output on the bench."
             )
 
 

@@ -49,6 +49,7 @@ _UNITS = (
     ("_rad_s", "rad/s"), ("_per_f3", "1/F³"), ("_per_f2", "1/F²"), ("_per_f", "1/F"),
     ("_v_per_v", "V/V"), ("_v_per_m", "V/m"), ("_hz", "Hz"), ("_kg", "kg"), ("_deg", "°"),
     ("_db", "dB"), ("scale_s", "S"), ("scale_std_s", "S"), ("stray_s", "S"), ("_s", "s"),
+    ("_n_s_per_m", "N s/m"), ("_n_per_m", "N/m"), ("_n_m2", "N m²"), ("_pa", "Pa"), ("_n", "N"),
     ("_m", "m"), ("_v", "V"), ("_f", "F"),
 )  # fmt: skip
 _NOT_SHOWN = {"covariance", "alternatives", "reference"}  # matrices, raw readings; own tables
@@ -208,7 +209,8 @@ def _row(key: str, item: Any, units: Mapping[str, str] = MappingProxyType({})) -
         shown = value_text(item.to_dict() | {"unit": ""})
         value, _, interval = shown.partition(" [")
         return key, item.unit, value, f"[{interval}" if interval else "—"
-    is_number = not isinstance(item, (str, bool))
+    parts = item if isinstance(item, list) else [item]
+    is_number = not any(isinstance(part, (str, bool)) for part in parts)
     table, _, last = key.rpartition(".")
     unit = _unit(key) or units.get(last if last not in ("low", "high") else table, "")
     return key, unit if is_number else "", value_text(item), ""

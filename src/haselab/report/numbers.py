@@ -117,6 +117,7 @@ def value_text(value: Any) -> str:
     if isinstance(value, (list, tuple)):
         if len(value) > _MOST_ITEMS:
             return f"{len(value)} values: {value_text(value[:_FIRST_ITEMS])}, …"
-        joint = " to " if len(value) == 2 else ", "
+        is_range = len(value) == 2 and not any(isinstance(item, str) for item in value)
+        joint = " to " if is_range else ", "
         return joint.join(value_text(item) for item in value)
     return str(value)

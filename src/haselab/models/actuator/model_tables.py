@@ -181,7 +181,9 @@ class OriginTable(_Table):
     @property
     def is_of_strains(self) -> bool:
         """Whether input and output are strains, as after the voltage map."""
-        return (self.input_unit, self.output_unit) == ("1", "1") and self.input.endswith("strain")
+        units = self.input_unit, self.output_unit
+        unnamed = units == ("", "") and self.output == "strain"  # as a study writes it
+        return self.input.endswith("strain") and (unnamed or units == ("1", "1"))
 
 
 class VoltagePlantTable(_Table):

@@ -161,5 +161,5 @@ PLAN = FigurePlan(
     "strain is the chosen baseline. C: strain against capacitance: every block of the fitted "
     "cycles (grey), means of the rising and the falling edge at equal times from the peak (blue), "
     "and the straight line through these means. D: strain measured by the camera, and strain "
-    "computed from capacitance with the quadratic map that the control loops use.",
+    "computed from capacitance with the map that the control loops use.",
 )

@@ -157,7 +157,7 @@ def feedthrough(law: ActuatorLaw, length_m: float, voltage_v: float, gain_m_per_
         ...     point = linearise(law, 5000.0, load_n, load_n / 9.81)
         ...     print(round(feedthrough(law, point.length_m, 5000.0, point.gain_m_per_v), 3))
         0.0
-        0.25
+        0.248
     """
     step_m, step_v = _STEP * law.free_length_m, max(_STEP * abs(voltage_v), 1e-3)
     lengths = length_m + step_m * np.array([-1.0, 1.0])

@@ -144,6 +144,14 @@ def command(
     limits = limits_of(model, loop["limits"])
     if note := default_limits_note(model, loop["limits"], limits):
         click.echo(f"haselab: {note}", err=True)
+    origin = read_origin(model)
+    if loop["limits"] is not None and origin.input_range is not None and origin.input_unit == "V":
+        low_v, high_v = origin.input_range
+        click.echo(
+            f"haselab: --limits count from the operating point of the model's records, whose input "
+            f"is {low_v:.3g} to {high_v:.3g} V. {model}",
+            err=True,
+        )
     setting = _setting(model, rate_hz, delay_s, limits)
     if posterior is None and loop["probability"] is not None:
         raise InputError(
@@ -174,7 +182,6 @@ def command(
             )
     if remark := design.nominal.step.remark:
         click.echo(f"haselab: warning: {remark}: {model}", err=True)
-    origin = read_origin(model)
     ends = origin.input_unit, origin.output_unit
     units = gain_units(*ends, strains=origin.is_of_strains)
     emit(answer, as_json=as_json, out=None, units=units)

@@ -9,7 +9,13 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from haselab.actuators import GRAVITY_M_S2, ActuatorLaw, equilibrium_m, linearise
+from haselab.actuators import (
+    GRAVITY_M_S2,
+    ActuatorLaw,
+    equilibrium_m,
+    feedthrough,
+    linearise,
+)
 from haselab.models.actuator import ActuatorTables
 from haselab.models.actuator.strain_map import StrainMap
 from haselab.rig.twin.config import TwinConfig
@@ -164,6 +170,23 @@ def test_the_closed_loop_settles_at_the_step(kind: Kind) -> None:
         )
         assert strain[last].std() < within
     assert 0.0 <= kind.recorded.value("S25.overshoot_pid") < 0.1
+
+
+def test_the_feedthrough_of_the_chirp_is_that_of_the_law(kind: Kind) -> None:
+    """The twin's law knows it exactly; only kinds with pouches have one in their file."""
+    load_n = kind.twin.load.mass_kg * GRAVITY_M_S2
+    point = linearise(kind.law, kind.baseline_v, load_n, kind.twin.load.mass_kg)
+    truth = feedthrough(kind.law, point.length_m, kind.baseline_v, point.gain_m_per_v)
+    row = kind.recorded.rows["S20.feedthrough"]
+    assert row["ci95"][0] <= truth <= row["ci95"][1]
+    assert row["std"] < 0.05
+    table = kind.tables.sensing.strain_map
+    assert table is not None
+    if kind.twin.kind == "dea-stack":
+        assert truth == 0.0 and table.feedthrough is None
+    else:
+        assert table.feedthrough == pytest.approx(row["value"])
+        assert table.feedthrough_std == pytest.approx(row["std"])
 
 
 def test_what_does_not_apply_is_not_determined_for_a_true_reason(kind: Kind) -> None:

@@ -17,7 +17,7 @@ KINDS = Path(__file__).resolve().parents[3] / "examples" / "kinds"
 
 
 def test_the_page_names_every_kind_that_has_an_example() -> None:
-    assert len(COMMANDS) == 6
+    assert len(COMMANDS) == 7
     for folder in KINDS.iterdir():
         assert f"`{folder.name}`" in PAGE.text
 

@@ -165,6 +165,7 @@ CALLS = {
         "rate_hz": (100.0, POSITIVE),
         "delay_s": (0.005, FINITE | {"negative": -1.0}),
         "probability": (None, NUMBER_OR_NONE),
+        "feedthrough": (0.3, FINITE | {"large": 1.5}),
         "seed": (0, WHOLE),
     },
     hl.twin: {

@@ -20,7 +20,6 @@ from haselab.control.plants.general_loops import (
     plant_output,
     trace_general,
 )
-from haselab.control.plants.modes import SampledLoops
 from haselab.control.reach import default_step
 from haselab.control.ringing import Ringing
 from haselab.control.simulate import LoopSetting
@@ -207,17 +206,9 @@ def _traces(
             plants = [plant] * len(candidates)
             traces = trace_ensemble(plants, candidates, reference, setting)
             measured, u = traces.measured.astype(float), traces.u.astype(float)
-            loops = SampledLoops.of(
-                plants,
-                candidates,
-                period_s=1.0 / setting.rate_hz,
-                measurement_delay_s=setting.measurement_delay_s,
-                feedthrough=setting.feedthrough,
-            )
-            poles += list(loops.poles())
         else:
             measured, u = trace_general(plant, candidates, reference, setting)
-            poles += list(closed_loop_poles(plant, candidates, setting))
+        poles += list(closed_loop_poles(plant, candidates, setting))
         outputs.append(plant_output(plant, measured, u, setting))
     return np.concatenate(outputs), poles
 

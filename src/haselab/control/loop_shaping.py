@@ -23,7 +23,6 @@ from haselab.control.plants.general_loops import (
     plant_output,
     trace_general,
 )
-from haselab.control.plants.modes import SampledLoops
 from haselab.control.reach import integrates
 from haselab.control.simulate import LoopSetting, simulate_loop
 from haselab.control.spec import DesignSpec
@@ -254,20 +253,9 @@ def predict(
 
 def _slowest_s(plant: AnyPlant, gains: PidGains, setting: LoopSetting) -> float:
     """Longest time constant of the closed loop, in s."""
-    period_s, delay_s = 1.0 / setting.rate_hz, setting.measurement_delay_s
-    if isinstance(plant, Plant):
-        loops = SampledLoops.of(
-            [plant],
-            [gains],
-            period_s=period_s,
-            measurement_delay_s=delay_s,
-            feedthrough=setting.feedthrough,
-        )
-        poles = loops.poles()[0]
-    else:
-        poles = closed_loop_poles(plant, [gains], setting)[0]
+    poles = closed_loop_poles(plant, [gains], setting)
     size = min(float(np.abs(poles).max()), 1.0 - 1e-12)
-    return -period_s / math.log(size) if size > 0.0 else 0.0
+    return -1.0 / setting.rate_hz / math.log(size) if size > 0.0 else 0.0
 
 
 def _simulated(

@@ -47,7 +47,7 @@ _KEPT_PULL, _MOST_KEPT = 0.075, 0.5
 _BLIND = 5.0  # times less capacitance per length at the lowest drive than at the one that holds
 _USUAL_NOISE = 2e-4  # strain, where it is not known
 # Of the reachable range: steps for slopes, and what is left out at its ends, where the drive is 0.
-_SHARE_STEP, _SHARE_INSIDE = 1e-4, 0.01
+_SLOPE_STEP, _INSIDE = 1e-4, 0.01
 _SENSED_POINTS = 401  # strains among which the end of the sensed range is found
 _BENCH = ("camera.", "sensing.", "start.")  # parameters of a fit that are none of the law
 
@@ -330,7 +330,7 @@ class KnownActuator:
         if not self.capacitance_follows_drive:
             return 0.0
         low, high = self.reachable()
-        step, inside = _SHARE_STEP * (high - low), _SHARE_INSIDE * (high - low)
+        step, inside = _SLOPE_STEP * (high - low), _INSIDE * (high - low)
         middle = min(max(strain, low + inside), high - inside)
         lengths = [self.length_m(middle + side * step) for side in (-1.0, 1.0)]
         volts = [

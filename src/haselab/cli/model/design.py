@@ -14,6 +14,7 @@ from haselab.base import InputError, ResultError
 from haselab.cli.actuator_file import load_actuator, save_section, warn_misspelled_in
 from haselab.cli.common import REAL, SEED, Real, answer_options, emit, waiting
 from haselab.cli.identify.common import axis_names
+from haselab.cli.model.doubts import sensed_loop
 from haselab.cli.model.loop_options import loop_options
 from haselab.cli.options import shared_option
 from haselab.cli.plot import save_plot
@@ -21,11 +22,9 @@ from haselab.control import (
     Design,
     DesignSpec,
     LoopSetting,
-    Saturation,
     design_controller,
 )
 from haselab.control.charts import loop_chart
-from haselab.control.feedthrough import feedthrough_doubt, with_feedthrough
 from haselab.control.gains import gain_units
 from haselab.control.plants.general import AnyPlant
 from haselab.control.plausible_design import USUAL_STRUCTURE
@@ -50,7 +49,6 @@ from haselab.pipelines.design.model_file import (
     read_loop,
     read_origin,
     read_posterior,
-    read_tables,
 )
 from haselab.pipelines.design.sections import (
     CONTROLLER_KEYS,
@@ -120,8 +118,8 @@ def command(
     MODEL is a model.json or an actuator file. The command reads [model], [drive] and the demands of
     an actuator file and writes its [controller], but leaves the file unchanged if --out is given.
     The margins include the delay of the loop and the feedthrough of the sensed strain. If the model
-    has a covariance, plausible plants are
-    drawn from it, and the share of them that keeps the margins is reported.
+    has a covariance, plausible plants are drawn from it, and the share of them that keeps the
+    margins is reported.
     """
     warn_misspelled_in(model)
     if out is None and model.suffix.lower() == ".toml":
@@ -152,7 +150,7 @@ def command(
             f"is {low_v:.3g} to {high_v:.3g} V. {model}",
             err=True,
         )
-    setting = _setting(model, rate_hz, delay_s, limits)
+    setting = sensed_loop(LoopSetting(rate_hz, delay_s, limits), model)
     if posterior is None and loop["probability"] is not None:
         raise InputError(
             f"--probability {loop['probability']:g} needs the covariance of the model, which the "
@@ -297,7 +295,8 @@ def _judge(
     if note := default_note(model, kind):
         click.echo(f"haselab: {note}", err=True)
     rate_hz, delay_s = loop_of(model, loop["rate_hz"], loop["delay_s"])
-    setting = _setting(model, rate_hz, delay_s, limits_of(model, loop["limits"]))
+    limits = limits_of(model, loop["limits"])
+    setting = sensed_loop(LoopSetting(rate_hz, delay_s, limits), model)
     plant, feedback = read_any_plant(model), feedback_of(held, rate_hz)
     found = loop_margins(plant, feedback, setting)
     if not found.stable:
@@ -318,18 +317,6 @@ def _judge(
     _save(model, out, section, None)
     emit(answer | {"parameters": held.parameters, "searched": False}, as_json=as_json, out=None)
     save_plot(plot, lambda: loop_chart(plant, feedback, setting, found.crossover_rad_s))
-
-
-def _setting(model: Path, rate_hz: float, delay_s: float, limits: Saturation) -> LoopSetting:
-    """The loop of a model; that of an actuator file with its feedthrough."""
-    setting = LoopSetting(rate_hz, delay_s, limits)
-    if model.suffix.lower() != ".toml":
-        return setting
-    tables = read_tables(model)
-    found = with_feedthrough(setting, tables)
-    if doubt := feedthrough_doubt(found, tables):
-        click.echo(f"haselab: warning: {doubt}: {model}", err=True)
-    return found
 
 
 def _save(model: Path, out: Path | None, section: dict[str, object], spec: Path | None) -> None:

@@ -7,6 +7,9 @@ from pathlib import Path
 import click
 
 from haselab.cli.actuator_file import warn_misspelled_in
+from haselab.control import LoopSetting
+from haselab.control.feedthrough import feedthrough_doubt, with_feedthrough
+from haselab.pipelines.design.model_file import read_tables
 from haselab.pipelines.design.stated_margins import (
     controller_doubt,
     delay_doubt,
@@ -14,7 +17,25 @@ from haselab.pipelines.design.stated_margins import (
     model_doubt,
 )
 
-__all__ = ["warn_doubts"]
+__all__ = ["sensed_loop", "warn_doubts"]
+
+
+def sensed_loop(setting: LoopSetting, model: Path) -> LoopSetting:
+    """The loop of a model, with the feedthrough of its actuator file; warn if nobody knows it.
+
+    Args:
+        setting: rate, delay and limits.
+        model: of the loop; a file that is no actuator file leaves the loop unchanged.
+    Returns:
+        The loop.
+    """
+    if model.suffix.lower() != ".toml":
+        return setting
+    tables = read_tables(model)
+    found = with_feedthrough(setting, tables)
+    if doubt := feedthrough_doubt(found, tables):
+        click.echo(f"haselab: warning: {doubt}: {model}", err=True)
+    return found
 
 
 def warn_doubts(path: Path, kind: str | None = None) -> None:

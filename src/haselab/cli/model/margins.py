@@ -11,16 +11,16 @@ import click
 from haselab.base import InputError, ResultError
 from haselab.cli.actuator_file import warn_misspelled_in
 from haselab.cli.common import REAL, answer_options, emit
+from haselab.cli.model.doubts import sensed_loop
 from haselab.cli.model.loop_options import loop_options
 from haselab.cli.options import shared_option
 from haselab.cli.plot import save_plot
 from haselab.control import LinearController, LoopSetting, PidGains
 from haselab.control.charts import loop_chart
-from haselab.control.feedthrough import feedthrough_doubt, with_feedthrough
 from haselab.control.stability.margins import loop_margins
 from haselab.pipelines.design.answer import margins_answer
 from haselab.pipelines.design.feedback import default_note, feedback_of, read_controller
-from haselab.pipelines.design.model_file import loop_of, read_any_plant, read_tables
+from haselab.pipelines.design.model_file import loop_of, read_any_plant
 from haselab.pipelines.design.sections import limits_of
 
 __all__ = ["command"]
@@ -71,9 +71,9 @@ def command(
     """Compute the stability margins of a controller.
 
     MODEL is an actuator file or a model.json. The margins include the delay of the loop and the
-    feedthrough of the sensed strain, for the nominal plant only. The
-    controller is the PID of --kp and --ki, or one of the actuator file: PI, PID, or any kind whose
-    controller has the method linear_feedback.
+    feedthrough of the sensed strain, for the nominal plant only. The controller is the PID of --kp
+    and --ki, or one of the actuator file: PI, PID, or any kind whose controller has the method
+    linear_feedback.
     """
     warn_misspelled_in(model)
     given, held = (kp, ki, kd, derivative_filter_s), None
@@ -85,12 +85,9 @@ def command(
     usual = (None, None) if loop is None else (loop.rate_hz, loop.measurement_delay_s)
     setting = LoopSetting(*loop_of(model, rate_hz, delay_s, usual))
     if model.suffix.lower() == ".toml":
-        tables = read_tables(model)
         with contextlib.suppress(InputError, ResultError):  # limits are no part of the margins
             setting = replace(setting, saturation=limits_of(model, None))
-        setting = with_feedthrough(setting, tables)
-        if doubt := feedthrough_doubt(setting, tables):
-            click.echo(f"haselab: warning: {doubt}: {model}", err=True)
+    setting = sensed_loop(setting, model)
     gains: PidGains | LinearController
     if any(value is not None for value in given):
         if kp is None or ki is None or kind is not None:

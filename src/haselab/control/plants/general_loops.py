@@ -16,7 +16,9 @@ from haselab.control.plants.general import (
     frequency_variants,
     static_gain,
 )
+from haselab.control.plants.modes import SampledLoops
 from haselab.control.simulate import LoopSetting
+from haselab.models.plant import Plant
 from haselab.models.rational import RationalModel
 
 __all__ = ["closed_loop_poles", "loop_variants", "plant_output", "trace_general"]
@@ -121,11 +123,20 @@ def trace_general(
 
 
 def closed_loop_poles(
-    model: RationalModel, gains: Sequence[PidGains], setting: LoopSetting
+    plant: AnyPlant, gains: Sequence[PidGains], setting: LoopSetting
 ) -> NDArray[np.complex128]:
     """Poles of the loops in the z-plane, without saturation. Shape `(C, states)`."""
     period_s = 1.0 / setting.rate_hz
-    held = _held(model, setting)
+    if isinstance(plant, Plant):
+        loops = SampledLoops.of(
+            [plant] * len(gains),
+            gains,
+            period_s=period_s,
+            measurement_delay_s=setting.measurement_delay_s,
+            feedthrough=setting.feedthrough,
+        )
+        return loops.poles()
+    held = _held(plant, setting)
     n, late = held.push.size, held.samples
     size = n + late + 2  # plant, delayed outputs, integrator, filter
     rows = []

@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Callable
 from dataclasses import dataclass, replace
+from functools import partial
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -15,7 +16,6 @@ from haselab.control.gains import PidGains
 from haselab.control.linear import LinearController
 from haselab.control.plants.general import AnyPlant, corners_of, sampled_response_of
 from haselab.control.plants.general_loops import closed_loop_poles
-from haselab.control.plants.modes import SampledLoops
 from haselab.control.simulate import LoopSetting
 from haselab.control.stability.encirclement import unstable_poles
 from haselab.models.rational import RationalModel
@@ -213,16 +213,14 @@ def margins(
     if rate_hz is not None and not 0.0 < rate_hz < math.inf:
         raise LimitError(f"rate = {rate_hz:g} Hz; it must be above 0 Hz, or none.")
 
-    def response(omega: ArrayLike) -> NDArray[np.complex128]:
-        return loop_response(
-            plant,
-            gains,
-            omega,
-            loop_delay_s=loop_delay_s,
-            rate_hz=rate_hz,
-            feedthrough=feedthrough,
-        )
-
+    response = partial(
+        loop_response,
+        plant,
+        gains,
+        loop_delay_s=loop_delay_s,
+        rate_hz=rate_hz,
+        feedthrough=feedthrough,
+    )
     omega = _with_delay(frequency_grid(plant, gains, rate_hz, 6000), plant.delay_s + loop_delay_s)
     loop = response(omega)
     finite = np.isfinite(loop)  # the grid may meet a pole on the axis
@@ -276,22 +274,17 @@ def _is_stable(
 ) -> bool:
     """Whether a sampled loop is stable: by its poles, or by encirclements."""
     if isinstance(gains, PidGains):
-        if isinstance(plant, RationalModel):
-            setting = LoopSetting(rate_hz, loop_delay_s, feedthrough=feedthrough)
-            poles = closed_loop_poles(plant, [gains], setting)[0]
-        else:
-            loops = SampledLoops.of(
-                [plant], [gains], period_s=1.0 / rate_hz, measurement_delay_s=loop_delay_s,
-                feedthrough=feedthrough,
-            )  # fmt: skip
-            poles = loops.poles()[0]
+        setting = LoopSetting(rate_hz, loop_delay_s, feedthrough=feedthrough)
+        poles = closed_loop_poles(plant, [gains], setting)
         return float(np.abs(poles).max()) <= 1.0 + _POLE_ERROR
-
-    def response(omega: ArrayLike) -> NDArray[np.complex128]:
-        return loop_response(
-            plant, gains, omega, loop_delay_s=loop_delay_s, rate_hz=rate_hz, feedthrough=feedthrough
-        )
-
+    response = partial(
+        loop_response,
+        plant,
+        gains,
+        loop_delay_s=loop_delay_s,
+        rate_hz=rate_hz,
+        feedthrough=feedthrough,
+    )
     omega = frequency_grid(plant, gains, rate_hz, _COARSE)
     loop = response(omega)
     good = np.isfinite(loop)

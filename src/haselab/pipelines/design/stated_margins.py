@@ -5,7 +5,6 @@ from __future__ import annotations
 import math
 import re
 from collections.abc import Mapping, Sequence
-from dataclasses import replace
 from pathlib import Path
 
 from haselab.base import InputError
@@ -125,11 +124,8 @@ def _margins(held: ControllerSection, file: Path, loop: tuple[float, float]) -> 
     """Margins with the model of the file; the worst ones where the section has its demands."""
     rate_hz, delay_s = loop
     feedback, plant = feedback_of(held, rate_hz), read_any_plant(file)
-    limits = held.limits
-    setting = LoopSetting(rate_hz, delay_s)
-    if limits is not None:
-        setting = replace(setting, saturation=Saturation(limits.low, limits.high))
-    setting = with_feedthrough(setting, read_tables(file))
+    limits = Saturation() if held.limits is None else Saturation(held.limits.low, held.limits.high)
+    setting = with_feedthrough(LoopSetting(rate_hz, delay_s, limits), read_tables(file))
     found = loop_margins(plant, feedback, setting)
     known = {key: getattr(found, key) for key in _STATED if not key.startswith(_WORST)}
     known[_STABLE] = float(found.stable)

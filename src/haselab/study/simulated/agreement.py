@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Iterator
 from dataclasses import dataclass, replace
+from functools import cached_property
 
 import numpy as np
 from numpy.typing import NDArray
@@ -127,7 +128,7 @@ class StepCase:
             for plant, loop in loop_variants(self.design.plant, self.loop, self.spread)
         )
 
-    @property
+    @cached_property
     def loop(self) -> LoopSetting:
         """The chip's loop, with the feedthrough of the actuator file."""
         settings = self.design.settings
@@ -193,11 +194,12 @@ def predicted_loop(
     settings, plant = case.design.settings, case.design.plant
     plant = replace(plant, natural_frequency_rad_s=factor * plant.natural_frequency_rad_s)
     limits = Saturation(settings.strain_low, settings.strain_high)
-    setting = LoopSetting(run.rate_hz, run.delay_s, limits, settings.strain_start, 1)
+    setting = LoopSetting(
+        run.rate_hz, run.delay_s, limits, settings.strain_start, 1, case.loop.feedthrough
+    )
     white = None
     if noise:
         white = np.random.default_rng(case.seed).normal(0.0, case.noise_std, run.time_s.size)
-    setting = replace(setting, feedthrough=case.loop.feedthrough)
     trace = simulate_loop(plant, case.gains, run.reference, setting, measurement_noise=white)
     return replace(run, strain=trace.y)
 

@@ -64,10 +64,9 @@ _UNEXPLAINED = (
 _FEEDBACK = 1e-6  # probability below which the input follows the residuals
 _NO_DISTURBANCE = 99.0  # per cent of fit above which no disturbance matters
 _FED_BACK = (
-    "The residuals predict the input. If a loop was closed during the record, a disturbance that "
-    "is not white biases the gain and the delay, and the intervals do not include this bias. "
-    "Record in open loop, or use a larger reference signal. In open loop, a nonlinear actuator "
-    "is the usual cause: try --choose nonlinear, or a smaller amplitude."
+    "The residuals predict the input. In open loop, the actuator is nonlinear: try --choose "
+    "nonlinear or a smaller amplitude. In closed loop, a disturbance biases gain and delay, and "
+    "the intervals do not include it: record in open loop."
 )
 _RESTING = (
     "A step at t = 0 is indistinguishable from an initial state; rest before it is assumed. "

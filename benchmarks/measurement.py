@@ -42,12 +42,12 @@ class Measurement:
 
     Args:
         module: below `benchmarks`.
-        quick: arguments of `rows` in the default run.
+        quick: arguments of `rows` in the default run; None: it measures only with `--full`.
         full: arguments of `rows` with `--full`.
     """
 
     module: str
-    quick: Mapping[str, Any] = field(default_factory=dict)
+    quick: Mapping[str, Any] | None = field(default_factory=dict)
     full: Mapping[str, Any] = field(default_factory=dict)
 
     def run(self, full: bool, most_s: float = math.inf) -> Measured:
@@ -67,7 +67,7 @@ class Measurement:
             return found
         context = multiprocessing.get_context("spawn")
         receiver, sender = context.Pipe(duplex=False)
-        arguments = (self.module, dict(self.full if full else self.quick), sender)
+        arguments = (self.module, dict((self.full if full else self.quick) or {}), sender)
         process = context.Process(target=_measure, args=arguments)
         process.start()
         sender.close()

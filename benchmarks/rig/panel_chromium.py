@@ -1,10 +1,11 @@
-"""STOP in Chromium: from `pointerdown` on the page to the revocation of the permission.
+"""The panel in Chromium: its first paint, and STOP from `pointerdown` to the revoked permission.
 
 `python -m benchmarks.rig.panel_chromium [--presses 100]`
 
 The page's clock and this process's clock are the same one of the computer. The revocation is seen
 by a thread that reads the interlock's file every 0.2 ms. First, one page is open; then its scripts
-are slowed down 6 times and seven other pages receive all streams.
+are slowed down 6 times and seven other pages receive all streams. The first paint is timed by the
+browser, from the start of the navigation to the first text or picture.
 """
 
 import argparse
@@ -28,6 +29,8 @@ from haselab.safety.interlock import Interlock
 READY = "document.getElementById('emergency-state').textContent === 'STOP: ready'"
 NOTE_PRESSES = """() => document.addEventListener('pointerdown',
     event => { window.pressed_ms = performance.timeOrigin + event.timeStamp; }, true)"""
+FIRST_PAINT = """() => performance.getEntriesByName('first-contentful-paint')[0].startTime"""
+LOADS = 5
 LATEST_S = 10.0
 
 
@@ -81,6 +84,15 @@ async def chromium_page(address: str, slowdown: int) -> AsyncIterator[Any]:
         await browser.close()
 
 
+async def first_paints(host: str, token: str) -> list[float]:
+    """Times in ms of pages that are loaded one after the other, each in a browser of its own."""
+    times_ms = []
+    for _ in range(LOADS):
+        async with chromium_page(f"http://{host}/?token={token}", 1) as found:
+            times_ms.append(await found.evaluate(FIRST_PAINT))
+    return times_ms
+
+
 async def pressed(
     process: int, host: str, token: str, presses: int, others: int, slowdown: int
 ) -> list[float]:
@@ -108,13 +120,17 @@ async def pressed(
 
 
 def rows(presses: int = 1000) -> Iterator[Row]:
-    """Measure one page, then a slow one beside seven others.
+    """Measure the first paint, then STOP on one page and on a slow one beside seven others.
 
     Args:
         presses: of STOP, for each of both.
     """
     if shutil.which("chromium") is None:
         return
+    with panel() as (_, host, token):
+        paints_ms = asyncio.run(first_paints(host, token))
+    yield Row("first paint of the page in Chromium", float(np.median(paints_ms)), "ms", 300.0,
+              False, f"slowest of {LOADS}: {max(paints_ms):.0f} ms")  # fmt: skip
     for others, slowdown, goal_ms in ((0, 1, 20.0), (PAGES - 1, 6, 50.0)):
         with panel() as (process, host, token):
             times_s = asyncio.run(pressed(process.pid, host, token, presses, others, slowdown))

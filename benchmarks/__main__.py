@@ -3,10 +3,10 @@
     python -m benchmarks [--full] [--minutes M] [SECTION ...]
 
 The default takes a representative part of each section: fewer seeds, records and sizes, and not
-the twins that are hard to identify. `--full` (`make bench-full`) takes all of them. Speeds are medians of several rounds of wall time, in which
-haselab and the other libraries take turns, so that another program slows down both. Trust the
-ratios. At the end every goal is listed, the missed ones last. The exit code is 1 if a benchmark
-failed, and 0 otherwise: a missed goal is a result.
+the twins that are hard to identify. `--full` (`make bench-full`) takes all of them. Speeds are
+medians of several rounds of wall time, in which haselab and the other libraries take turns, so
+that another program slows down both. Trust the ratios. At the end every goal is listed, the missed
+ones last. The exit code is 1 if a benchmark failed, and 0 otherwise: a missed goal is a result.
 """
 
 import argparse
@@ -60,7 +60,7 @@ SECTIONS: dict[str, tuple[Measurement, ...]] = {
     "stream": (
         Measurement("sensing.stream", quick={"size_gb": 0.2, "rounds": 1}),
         Measurement(
-            "tracking.stream", quick={"frames": 200, "kinds": ("tiff", "ffv1"), "rounds": 1}
+            "tracking.stream", quick={"frames": 2000, "kinds": ("tiff", "ffv1"), "rounds": 1}
         ),
     ),
     "tracking": (

@@ -101,7 +101,8 @@ class _Link:
                 return
             *lines, text = (text + data).split(b"\n")
             for command in map(json.loads, lines):
-                if command.get("do") == "arm":  # a study is checked first, which takes a second
+                # A study is checked first, which takes a second; STOP waits for no other command.
+                if command.get("do") in ("arm", "stop"):
                     job = threading.Thread(target=self._reply, args=(client, command), daemon=True)
                     job.start()
                 else:
@@ -198,6 +199,16 @@ def _run(bench: LiveBench, block_s: float, *, paced: bool, ended: threading.Even
                 time.sleep(max(next_s - time.monotonic(), 0.0))
 
 
+def _ended(fault: str) -> str:
+    """The last line for the terminal."""
+    if not fault:
+        return "haselab: The panel has ended, and 0 V was commanded."
+    return (
+        f"haselab: The panel has ended, but 0 V IS NOT CONFIRMED ({fault.rstrip('.')}). Press the "
+        "emergency stop of the bench."
+    )
+
+
 def _end_study_at(ended: threading.Event, bench: LiveBench) -> None:
     """End the study that is being played when the panel ends."""
     ended.wait()
@@ -265,8 +276,9 @@ def main(words: list[str]) -> int:
             )
             live = folder / "live"
             with LiveWriter(live, about.rate_hz, about.block_samples, scales) as writer:
+                guarded = guard(rig, safety)
                 bench = LiveBench(
-                    guard(rig, safety), writer, read_loop, folder / "camera.jpg",
+                    guarded, writer, read_loop, folder / "camera.jpg",
                     lambda chosen: StudyJob.of(files, file, chosen), player, lease_s,
                     lambda: rig_safe_runs(folder),
                 )  # fmt: skip
@@ -281,6 +293,7 @@ def main(words: list[str]) -> int:
                     _run(bench, about.block_s, paced=rig.simulated, ended=ended)
                 finally:
                     bench.close()
+                    print(_ended(guarded.unconfirmed()), file=sys.stderr, flush=True)
     except HaselabError as error:
         verb = "refused" if isinstance(error, InputError) else "failed"
         print(f"{verb} {' '.join(str(error).split())}", flush=True)

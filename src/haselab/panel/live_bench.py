@@ -29,6 +29,7 @@ from haselab.panel.live_signals import IdleWatch, LiveSignals
 from haselab.panel.page_leases import PageLeases
 from haselab.panel.pages.study_job import StudyJob
 from haselab.panel.pages.values import number, up_to_millivolts
+from haselab.panel.stop_process import REASON
 from haselab.panel.study_player import PictureFile, StudyPlayer
 from haselab.runtime.closed_loop import ClosedLoop
 from haselab.runtime.loop import LoopSettings
@@ -149,8 +150,8 @@ class LiveBench:
         """Carry out a command of a page.
 
         Args:
-            what: `request`, `cancel`, `arm`, `drive`, `loop`, `open`, `confirm`, `disarm`, `lease`
-                or `leave`.
+            what: `request`, `cancel`, `arm`, `drive`, `loop`, `open`, `confirm`, `disarm`, `lease`,
+                `leave`, or `stop`, which every page may send at any age.
             holder: the page.
             values: arguments of the command.
             at_s: time of the last data that the page received, or of its sign of life; see
@@ -172,6 +173,8 @@ class LiveBench:
         if what == "lease":
             self._leases.renew(holder, at_s)
             return {}
+        if what == "stop":  # the second way, for a page whose stop process does not answer
+            return {"commanded": not self.stop(REASON)}
         if what not in commands:
             raise InputError(
                 f"There is no command {shown(what)}. Use one of: {', '.join(commands)}."

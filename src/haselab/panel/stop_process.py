@@ -32,10 +32,10 @@ from typing import Any
 
 from haselab.safety.interlock import Interlock
 
-__all__ = ["COMMANDED", "StopServer", "main", "rig_safe_runs"]
+__all__ = ["COMMANDED", "REASON", "StopServer", "main", "rig_safe_runs"]
 
 COMMANDED = b"0 V commanded"  # answer of the bench process; any other one is a fault
-_REASON = "STOP was pressed on the panel"
+REASON = "STOP was pressed on the panel"
 _RIG_SAFE = "rig-safe.lock"  # in FOLDER, locked while `haselab rig safe` runs
 _NICENESS = -10
 _ANSWER_S = 2.0  # longest wait for the bench process
@@ -181,7 +181,7 @@ class _Stop:
 
     def __call__(self) -> dict[str, object]:
         begun_s = time.perf_counter()
-        self._interlock.revoke(_REASON)
+        self._interlock.revoke(REASON)
         revoked_s = time.perf_counter() - begun_s
         thread = threading.Thread(target=self._rig_safe, daemon=True)
         thread.start()
@@ -203,7 +203,7 @@ class _Stop:
             try:
                 box.bind(str(own))
                 box.settimeout(wait_s)
-                box.sendto(_REASON.encode(), str(self._folder / "stop.sock"))
+                box.sendto(REASON.encode(), str(self._folder / "stop.sock"))
                 return box.recv(512)
             finally:
                 own.unlink(missing_ok=True)

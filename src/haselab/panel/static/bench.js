@@ -10,15 +10,24 @@ export function limitOf(state, v = state.limit_v) {
   return `${sign}${fixed(v, 3)} V (${sign}${fixed(v * state.gain / 1000, 2)} kV)`;
 }
 
+// What was refused; it is scrolled into view.
+export function Said({ error }) {
+  const place = useRef(null);
+  useEffect(() => { place.current?.scrollIntoView({ block: "nearest" }); }, [error]);
+  return error ? html`<p class="error" role="alert" ref=${place}>${error}</p>` : null;
+}
+
 // Two steps: read the limits, then type one. With a study, the bench is armed to play it.
 export function Arming({ state, link, say, study = null, onArmed = () => {} }) {
   const [request, setRequest] = useState(null);
   const [limit, setLimit] = useState("");
-  const typed = useNumber(limit, { rule: { low: 0, high: state.high_v }, input: setLimit });
+  const typed = useNumber(limit, { rule: { above: 0, high: state.high_v }, least: 0, input: setLimit });
   const [known, setKnown] = useState(false);
   const [sent, setSent] = useState(false);
   const open = useRef(false); // whether a request waits for the second step
   open.current = request !== null && !sent;
+  const field = useRef(null);
+  useEffect(() => { field.current?.focus(); }, [request]);
   const cancel = () => { setRequest(null); link.ask("cancel"); };
   useEffect(() => () => { if (open.current) link.ask("cancel"); }, []);
   async function ask() {
@@ -48,9 +57,10 @@ export function Arming({ state, link, say, study = null, onArmed = () => {} }) {
     <p><strong>${state.simulated ? "SIMULATED bench: no voltage is applied." : "HIGH VOLTAGE WILL BE APPLIED. Keep clear."}</strong></p>
     <p>${request.limits}</p>
     ${request.reason && html`<p class="error">The bench was made safe. Reason: ${request.reason}</p>
-      <label><input type="checkbox" checked=${known} onChange=${(e) => setKnown(e.target.checked)} /> The cause has been removed.</label>`}
+      <label><input type="checkbox" checked=${known} onChange=${(e) => setKnown(e.target.checked)} /> The cause has been removed.</label>
+      ${!known && html`<p>Arm is possible once this box is ticked.</p>`}`}
     <label>Highest drive of this run, in V at the amplifier's input, at most ${limitOf(state, state.high_v)}
-      <input ...${typed.field} />
+      <input ...${typed.field} ref=${field} />
     </label>${typed.line}
     <div class="row"><button class="danger" type="submit" disabled=${sent || (request.reason && !known)}>${sent ? "Checking …" : study === null ? "Arm" : "Arm and play"}</button>
     <button type="button" onClick=${cancel}>Cancel</button></div>

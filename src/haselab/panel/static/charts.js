@@ -23,8 +23,9 @@ const range = (low, high, unit) => {
   return digits(low) === digits(high) ? `${digits(high)} ${unit}` : `${digits(low)} to ${digits(high)} ${unit}`;
 };
 
-// Ticks of the time axis: as many decimals as their distance needs.
-const seconds = (u, ticks, axis, space, step) => ticks.map((v) => `${v.toFixed(Math.max(0, Math.ceil(-Math.log10(step) - 1e-9)))} s`);
+// Ticks of the time axis: as many decimals as their distance needs, such as one for 2.5 s.
+const decimals = (step) => [0, 1, 2, 3, 4, 5].find((n) => Math.abs(step * 10 ** n - Math.round(step * 10 ** n)) < 1e-6) ?? 6;
+export const seconds = (u, ticks, axis, space, step) => ticks.map((v) => `${v.toFixed(decimals(step))} s`);
 
 export class Charts {
   constructor(root, onZoom, onResize) {

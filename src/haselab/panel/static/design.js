@@ -1,7 +1,8 @@
 // Margins, frequency response and step of the identified model, with gains to drag.
 import { html, useState, useEffect, useRef } from "/static/vendor/htm-preact.js";
 import { resolved } from "/static/charts.js";
-import { useNumber } from "/static/number.js";
+import { Said } from "/static/bench.js";
+import { Range, useNumber } from "/static/number.js";
 
 const STEPS = 400; // of a slider; 0 is a gain of 0, the rest is logarithmic
 const DECADES = 4;
@@ -103,13 +104,14 @@ function Budget({ found }) {
     <tr><th scope="row">Flash</th><td>${share(found.flash_bytes, found.flash_bytes_available, "B")}</td></tr></tbody></table>`;
 }
 
-function Gain({ about, value, highest, put }) {
+function Gain({ about, value, highest, put, fields }) {
   const typed = useNumber(String(value), { rule: { low: 0 }, enter: put, leave: "commit" });
+  fields[about.name] = typed.read;
   const label = `${about.label}${about.unit ? ` in ${about.unit}` : ""}`;
   return html`<div class="gain">
     <label for=${about.name}>${label}</label>
-    <input id=${about.name} type="range" min="0" max=${STEPS} step="1" value=${toPosition(value, highest)} aria-valuetext=${`${value} ${about.unit}`}
-      onInput=${(e) => put(toGain(Number(e.target.value), highest))} />
+    <${Range} id=${about.name} min="0" max=${STEPS} step="1" value=${toPosition(value, highest)} aria-valuetext=${`${value} ${about.unit}`}
+      put=${(position) => put(toGain(position, highest))} />
     <input aria-label=${`${label}, typed`} ...${typed.field} />${typed.line}</div>`;
 }
 
@@ -121,6 +123,7 @@ export default function Design({ link, state }) {
   const [said, say] = useState({ text: "", bad: false });
   const [busy, setBusy] = useState("");
   const [budget, setBudget] = useState(null);
+  const fields = useRef({}); // by gain: reads what is typed, null if it is not a number
   const requests = useRef(null);
   if (requests.current === null) {
     requests.current = {
@@ -159,6 +162,7 @@ export default function Design({ link, state }) {
     change(answer.gains);
   }
   async function write() {
+    if (GAINS.some(({ name }) => fields.current[name]?.() === null)) { say({ text: "Not written: a field has no valid number.", bad: true }); return; }
     const answer = await during("write", () => link.request("design-write", { ...gains, sha256: found.sha256 }));
     if (answer.error) say({ text: answer.error, bad: true });
     else {
@@ -186,17 +190,17 @@ export default function Design({ link, state }) {
         <p>${about.file}</p>
         ${about.kind === null && html`<p>The file has no controller yet. Compute gains, or move the sliders.</p>`}
         ${gains === null && html`<p>The controller has kind = ${about.kind}, but this page changes only the gains of a PI or PID. Edit its parameters in the file.</p>`}
-        ${gains !== null && GAINS.map((one) => html`<${Gain} key=${one.name} about=${one} value=${gains[one.name]} highest=${about.ranges[one.name]} put=${put(one.name)} />`)}
+        ${gains !== null && GAINS.map((one) => html`<${Gain} key=${one.name} about=${one} value=${gains[one.name]} highest=${about.ranges[one.name]} put=${put(one.name)} fields=${fields.current} />`)}
         ${gains !== null && html`<div class="row">
           <button type="button" disabled=${busy !== ""} onClick=${compute}>${busy === "compute" ? "Computing …" : "Compute gains"}</button>
           <button type="button" disabled=${busy !== ""} onClick=${reopen}>Read the file again</button>
-          <button type="button" disabled=${busy !== "" || !isNew} onClick=${write}>Write to the actuator file</button></div>`}
-        <p role="status" class=${said.bad ? "error" : ""}>${said.text}</p>
+          <button type="button" disabled=${busy !== "" || !isShown} onClick=${write}>Write to the actuator file</button></div>`}
+        ${said.bad ? html`<${Said} error=${said.text} />` : html`<p role="status">${said.text}</p>`}
       </div>
       ${isShown && html`<div class=${`card ${isNew ? "" : "old"}`}><h2>Margins</h2>
         <${Margins} found=${found.margins} caption=${`At ${digits(found.margins.rate_hz)} Hz with a delay of ${digits(1e3 * found.margins.delay_s)} ms`} />
         ${gains !== null && html`<div class=${same(demands?.gains ?? null, gains) ? "" : "old"}>
-          ${demands === null ? html`<p>Checking the demands …</p>` : demands.error ? html`<p class="error">${demands.error}</p>` : html`
+          ${!same(demands?.gains ?? null, gains) ? html`<p>Checking the demands …</p>` : demands.error ? html`<p class="error">${demands.error}</p>` : html`
             ${demands.shortfalls.length ? html`<p class="error">Demands not met for the worst natural frequency within frequency_spread: ${demands.shortfalls.join("; ")}.</p>` : html`<p>All demands are met.</p>`}
             <p>${demands.plausible}.</p>`}</div>`}
       </div>`}

@@ -1,12 +1,14 @@
 // STOP depends on nothing else in the page: it has its own script, port and connection. The page
 // contains the port, so that STOP works even if the web server hangs right after it has sent the page.
+// A press also goes through the connection of the page, in case the process of STOP hangs.
 "use strict";
 (() => {
   const button = document.getElementById("emergency");
   const state = document.getElementById("emergency-state");
   const address = `http://${location.hostname}:${button.dataset.port}`;
   const ANSWER_MS = 3000; // the stop process waits 2 s for the bench process
-  let pressed = false;
+  let pressed = false; // its result stays for some seconds
+  let unconfirmed = false; // the last press
   let pressedAt = -Infinity;
   let socket = null; // to STOP; a message on it leaves the browser sooner than a request
 
@@ -15,36 +17,43 @@
     state.classList.toggle("bad", bad);
   };
 
+  const now = () => new Date().toTimeString().slice(0, 8);
+  const later = (ms) => new Promise((resolve) => setTimeout(resolve, ms));
+
   const answers = () => fetch(`${address}/ready`, { signal: AbortSignal.timeout(2000) }).then((answer) => answer.ok, () => false);
 
   // Why STOP of this page would not work now; empty if it answers.
   window.stopObstacle = async () => (await answers() ? "" : `STOP of this page does not answer at ${address}, so it cannot arm the bench. Restart the panel, or, if this page comes through a tunnel, let that port through, too.`);
 
   async function ready() {
-    if (!await answers()) show("STOP DOES NOT ANSWER. Press the emergency stop of the bench.", true);
-    else {
+    if (!await answers()) {
+      if (!pressed) show("STOP DOES NOT ANSWER. Press the emergency stop of the bench.", true);
+    } else {
       if (socket === null || socket.readyState > WebSocket.OPEN) socket = new WebSocket(`${address.replace("http", "ws")}/socket`);
-      if (!pressed) show("STOP: ready", false);
+      if (!pressed) show(unconfirmed ? "STOP: ready again. THE LAST PRESS WAS NOT CONFIRMED." : "STOP: ready", unconfirmed);
     }
     setTimeout(ready, 2000);
   }
 
   async function stop() {
     if (socket !== null && socket.readyState === WebSocket.OPEN) socket.send("stop");
+    const other = Promise.resolve(window.stopBesides?.()).catch(() => null);
     pressed = true;
     pressedAt = performance.now();
     button.classList.add("pressed");
-    show("STOP: sent", false);
+    show("STOP: sent", state.classList.contains("bad"));
     try {
       const answer = await fetch(`${address}/stop`, { method: "POST", keepalive: true, signal: AbortSignal.timeout(ANSWER_MS) });
       const found = await answer.json();
       const unsafe = found.fault ? `0 V IS NOT CONFIRMED (${found.fault}).` : "THE BENCH PROCESS DOES NOT ANSWER.";
-      show(found.commanded ? `STOP: 0 V commanded at ${new Date().toTimeString().slice(0, 8)}` : `${unsafe} Press the emergency stop of the bench.`, !found.commanded);
+      unconfirmed = !found.commanded;
+      show(found.commanded ? `STOP: 0 V commanded at ${now()}` : `${unsafe} Press the emergency stop of the bench.`, unconfirmed);
     } catch {
-      show("STOP DOES NOT ANSWER. Press the emergency stop of the bench.", true);
+      unconfirmed = !(await Promise.race([other, later(500)]))?.answer?.commanded;
+      show(unconfirmed ? "STOP DOES NOT ANSWER. Press the emergency stop of the bench." : `0 V commanded at ${now()}, but STOP DOES NOT ANSWER. Restart the panel.`, true);
     }
     button.classList.remove("pressed");
-    if (!state.classList.contains("bad")) setTimeout(() => { pressed = false; }, 5000); // a failure stays
+    setTimeout(() => { pressed = false; }, 5000);
   }
 
   button.addEventListener("pointerdown", stop);

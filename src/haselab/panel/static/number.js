@@ -6,6 +6,23 @@ const BEGUN = /^\s*[+-]?(\d*\.?\d*|(\d+\.?\d*|\.\d+)e[+-]?\d*)\s*$/i; // of a nu
 const COMMA = /^[+-]?\d*,\d+(e[+-]?\d+)?$/i;
 let fields = 0;
 
+const HANDLE_PX = 28; // from the middle of a handle: a finger is on it
+
+// A slider that a finger moves only by its handle: a swipe that scrolls the page may begin anywhere on it.
+export function Range({ value, put, ...rest }) {
+  const held = useRef(true);
+  function down({ target, pointerType, clientX }) {
+    const box = target.getBoundingClientRect(), share = (target.value - target.min) / (target.max - target.min);
+    const handle = box.left + 8 + share * (box.width - 16);
+    held.current = pointerType !== "touch" || Math.abs(clientX - handle) <= HANDLE_PX;
+  }
+  function moved({ target }) {
+    if (held.current) put(Number(target.value));
+    else target.value = value;
+  }
+  return html`<input type="range" value=${value} ...${rest} onPointerDown=${down} onKeyDown=${() => { held.current = true; }} onInput=${moved} />`;
+}
+
 // The number in a text, or what is wrong with the text.
 export function numberOf(text, { low = -Infinity, high = Infinity, above = -Infinity, whole = false } = {}) {
   const word = text.trim(), value = Number(word), wrong = (problem) => ({ value: null, problem });

@@ -1,10 +1,11 @@
 import { html, render, useState, useEffect, useReducer } from "/static/vendor/htm-preact.js";
 import { Charts } from "/static/charts.js";
 import { Link } from "/static/link.js";
-import { Arming, Playing, Progress, kilo, limitOf } from "/static/bench.js";
-import { useNumber } from "/static/number.js";
+import { Arming, Playing, Progress, Said, kilo, limitOf } from "/static/bench.js";
+import { Range, useNumber } from "/static/number.js";
 
 const STALE_MS = 450;
+const LOST_MS = 1500; // without data: what is shown of the bench is old, and commands are useless
 const MOST_PAUSE_MS = 1000; // between two draws
 let frame = null;
 let charts = null;
@@ -15,6 +16,10 @@ const link = new Link((found) => {
   frame = found;
   if (!drawing) drawNewest();
 }, () => redraw());
+
+window.stopBesides = () => link.ask("stop");
+const leaving = { asks: false }; // while this page has armed the bench
+addEventListener("beforeunload", (event) => { if (leaving.asks) event.preventDefault(); });
 
 // Pauses three times as long as a draw took, but for 1 s at most, so that a slow computer is free for STOP.
 async function drawNewest() {
@@ -60,7 +65,7 @@ function Slider({ name, unit, low, high, step, value, send, about }) {
   const now = sent ?? String(Number(value.toPrecision(6)));
   const typed = useNumber(now, { least: low, most: high, enter: put, leave: "reset" });
   return html`<label>${name}, in ${unit}${about ? `: ${about}` : ""}
-    <input type="range" min=${low} max=${high} step=${step} value=${now} onInput=${(e) => put(Number(e.target.value))} /></label>
+    <${Range} min=${low} max=${high} step=${step} value=${now} put=${put} /></label>
     <label>${name}, typed, in ${unit} (press Enter)
     <input ...${typed.field} /></label>${typed.line}`;
 }
@@ -73,11 +78,11 @@ function Live({ state, say }) {
   return html`
     ${note && html`<p role="status">${note}</p>`}
     <p class="badge live">Armed by this page up to ${limitOf(state)}</p>
-    <p>The sensing signal is on, also while the drive is 0 V.</p>
+    <p>The sensing signal is on, also while the drive is 0 V. Driving by hand is not recorded.</p>
     <${Slider} name="Drive" unit="V" low=${low} high=${state.limit_v} step="0.01" value=${state.target_v}
       about=${`now ${kilo(state.drive_v, state.gain)}, ${state.mode === "loop" ? "set by the controller" : `changes by 1 V/s (${Number((state.gain / 1000).toPrecision(3))} kV/s at the output)`}`} send=${(v) => ask("drive", { value_v: v })} />
     ${state.loop === null
-      ? html`<p>The loop cannot be closed. Start the panel with <code>--actuator actuator.toml</code>, a file with both maps and a controller. To make one from example records, run <code>haselab example actuator</code> and follow its README.md.</p>`
+      ? html`<p>The loop cannot be closed. Start the panel with <code>--actuator FILE</code>, where FILE is an actuator file with both maps and a controller. A study with <code>[triangle]</code>, <code>[chirp]</code> and <code>[steps]</code> writes one, actuator.toml, into the folder of its recording. For one from example records, run <code>haselab example actuator --out example</code> and follow its README.md.</p>`
       : html`<${Slider} name="Desired strain" unit="%" low=${100 * state.loop[0]} high=${100 * state.loop[1]} step="0.1"
           value=${100 * (state.reference ?? 0)} about=${state.mode === "loop" ? "closed loop" : "the loop is open; moving this slider closes it, and the drive jumps to what the controller puts out"}
           send=${(v) => ask("loop", { strain: v / 100 })} />`}
@@ -128,9 +133,9 @@ const TABS = {
 function Lazy({ from, ...rest }) {
   const [found, find] = useState({ part: null, error: "" });
   useEffect(() => {
-    import(from).then((module) => find({ part: module.default, error: "" }), (error) => find({ part: null, error: String(error) }));
+    import(from).then((module) => find({ part: module.default, error: "" }), () => find({ part: null, error: "there is no connection to the panel. Check that it runs, then open this page again" }));
   }, [from]);
-  if (found.error) return html`<p class="error">This page cannot be loaded: ${found.error}</p>`;
+  if (found.error) return html`<p class="error">This page cannot be loaded: ${found.error}.</p>`;
   return found.part ? html`<${found.part} ...${rest} />` : html`<p>Loading …</p>`;
 }
 
@@ -144,8 +149,7 @@ function Panel() {
       if (columns !== link.view.columns) link.setView({ columns });
     });
   }, []);
-  const stale = link.age_ms > STALE_MS;
-  document.body.classList.toggle("stale", stale);
+  const stale = link.age_ms > STALE_MS, lost = link.age_ms > LOST_MS;
   const state = frame?.state?.stage ? frame.state : null;
   const seconds = link.age_ms / 1000;
   const age = Number.isFinite(seconds) ? `NO NEW DATA for ${seconds.toFixed(1)} s` : "NO DATA YET";
@@ -154,13 +158,19 @@ function Panel() {
   const tripped = state?.stage === "tripped";
   useEffect(() => { if (tripped) say(""); }, [tripped]); // the reason of the trip is shown instead
   const paused = link.view.end_s !== null;
+  document.body.classList.toggle("stale", stale);
+  document.body.classList.toggle("paused", paused);
+  document.body.classList.toggle("lost", lost);
+  leaving.asks = mine && !lost;
+  const stage = state ? `${STAGES[state.stage] ?? state.stage}${live ? `, ${kilo(state.drive_v, state.gain)}` : ""}` : "";
+  const old = "What is shown of the bench is old, and commands are not carried out.";
   const jumped = typeof frame?.gap_s === "number" && frame.gap_s > (link.view.end_s ?? frame.end_s) - link.view.span_s;
   return html`
     <header>
       <h1>${state ? state.name : "haselab panel"}</h1>
       ${state?.simulated && html`<span class="badge">SIMULATED</span>`}
-      <span class=${`badge ${live ? "live" : ""} ${state?.stage === "tripped" ? "bad" : ""}`} role="status">${state ? `Bench: ${STAGES[state.stage] ?? state.stage}${live ? `, ${kilo(state.drive_v, state.gain)}` : ""}` : "Bench: unknown"}</span>
-      <span id="age" class=${`badge ${stale ? "bad" : ""}`} role="status">${stale ? age : paused ? "VIEW PAUSED" : "data live"}</span>
+      <span class=${`badge ${live ? "live" : ""} ${stale || state?.stage === "tripped" ? "bad" : ""}`} role="status">${state === null ? "Bench: unknown" : stale ? `Bench: unknown (last: ${stage})` : `Bench: ${stage}`}</span>
+      <span id="age" class=${`badge ${stale ? "bad" : paused ? "live" : ""}`} role="status">${stale ? age : paused ? `VIEW PAUSED at ${link.view.end_s.toFixed(1)} s` : "data live"}</span>
     </header>
     <nav class="row" aria-label="Pages">
       ${Object.keys(TABS).map((name) => html`<button type="button" aria-current=${name === tab ? "page" : "false"} onClick=${() => open(name)}>${name}</button>`)}
@@ -170,7 +180,7 @@ function Panel() {
       <section class="charts" aria-label="Signals">
         <div class="row" role="group" aria-label="View">
           <button type="button" aria-pressed=${paused} onClick=${() => link.setView(paused ? { end_s: null } : { end_s: frame?.end_s ?? null })}>${paused ? "Resume" : "Pause"}</button>
-          ${[1, 10, 60, 600].map((s) => html`<button type="button" onClick=${() => link.setView({ span_s: s })}>${s} s</button>`)}
+          ${[1, 10, 60, 600].map((s) => html`<button type="button" aria-pressed=${link.view.span_s === s} onClick=${() => link.setView({ span_s: s })}>${s} s</button>`)}
           ${jumped && html`<span class="error" role="status">The time of the bench jumped at ${frame.gap_s.toFixed(2)} s. Earlier data are not shown.</span>`}
           <span>${Number(link.view.span_s.toPrecision(3))} s shown. Drag over a plot to zoom. Double-click a plot to return to live data.</span>
         </div>
@@ -179,15 +189,18 @@ function Panel() {
       <section class="controls" aria-label="Bench">
         <div class=${`card ${live ? "warning" : ""}`}>
           <h2>Bench</h2>
+          ${lost && state !== null && html`<p class="error" role="status">${old}</p>`}
+          <fieldset class="plain" disabled=${lost}>
           ${link.problem && html`<p class="error" role="alert">${link.problem}</p>`}
-          ${error && html`<p class="error" role="alert">${error}</p>`}
+          <${Said} error=${error} />
           ${state?.extrapolated && html`<p class="error" role="status">The strain is extrapolated: the capacitance is outside the range of the strain map.</p>`}
-          ${state?.reason && html`<p class=${state.stage === "tripped" ? "error" : ""}>Last message of the bench: ${state.reason}</p>`}
+          ${state?.reason && html`<p class=${state.stage === "tripped" ? "error" : ""}>Last message of the bench: ${state.reason}${!live && state.drive_v === 0 ? " The drive is 0 V." : ""}</p>`}
           ${state === null ? html`<p>No data from the bench process. If this does not change, read the messages in the terminal of haselab panel.</p>`
             : mine ? html`<${Live} state=${state} say=${say} />`
             : live ? html`<p class="badge live">Armed by another page up to ${limitOf(state)}</p>
               ${state.mode === "study" && html`<p>It plays a study.</p><${Progress} state=${state} />`}`
             : html`<${Arming} state=${state} link=${link} say=${say} />`}
+          </fieldset>
         </div>
         <${Camera} filming=${live} />
       </section>

@@ -215,7 +215,7 @@ function Picker({ link }) {
   const searches = useRef(0);
   const wanted = useRef(null);
   const frame = useRef(null);
-  const card = useRef(null);
+  const card = useRef(null), note = useRef(null);
   const work = useWork();
   const view = useView(picture, frame);
   const fail = (found) => { say({ text: found.error, bad: true }); return null; };
@@ -264,6 +264,7 @@ function Picker({ link }) {
   }, []);
 
   useEffect(() => { card.current?.scrollIntoView({ block: "nearest" }); }, [done]);
+  useEffect(() => { if (said.bad) note.current?.scrollIntoView({ block: "nearest" }); }, [said]);
 
   const ends = work.marks.filter((one) => one.kind === "ruler");
   const lengthRule = { above: 0 }, distance = numberOf(work.length, lengthRule).value;
@@ -355,10 +356,10 @@ function Picker({ link }) {
 
   if (list === null) return html`<p role=${said.bad ? "alert" : "status"} class=${said.bad ? "error" : ""}>${said.text || "Looking for videos …"}</p>`;
   const searching = pending > 0 ? `Looking for dots: ${pending} ${pending > 1 ? "searches" : "search"} …` : "";
-  const message = html`<p role=${said.bad ? "alert" : "status"} class=${said.bad && !searching ? "error" : ""}>${searching || said.text}</p>`;
+  const message = html`<p role=${said.bad ? "alert" : "status"} class=${said.bad && !searching ? "error" : ""} ref=${note}>${searching || said.text}</p>`;
   const mark = work.marks.find((one) => one.id === chosen);
   const points = work.marks.filter((one) => one.kind === "point");
-  const saved = done && done.marks === work.marks && html`<div class="card" role="status" ref=${card}><h2>Saved</h2>
+  const saved = done && done.marks === work.marks && !said.bad && html`<div class="card" role="status" ref=${card}><h2>Saved</h2>
       <p>${done.points} points: <code>${done.path}</code></p>
       ${done.lost.length > 0 && html`<p class="error">Lost already in the next frame: ${done.lost.slice(0, 10).join(", ")}${done.lost.length > 10 ? ` and ${done.lost.length - 10} others` : ""}. Pick them on a dot, or leave them out.</p>`}
       <p>${done.scale_mm_per_px ? `Scale: ${done.scale}. ` : "No scale: lengths stay in pixels. "}Track the points with this command:</p><p><code>${done.command}</code></p></div>`;

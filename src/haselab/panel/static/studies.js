@@ -1,6 +1,6 @@
 // Choose, check and play a study; the list of recordings.
 import { html, useState, useEffect, useMemo } from "/static/vendor/htm-preact.js";
-import { Arming, Playing, Progress, fixed, kilo, limitOf } from "/static/bench.js";
+import { Arming, Playing, Progress, Said, fixed, kilo, limitOf } from "/static/bench.js";
 
 const number = (v) => (v === null || v === undefined ? "" : Number(v.toPrecision(5)));
 const clock = new Intl.DateTimeFormat("sv-SE", { dateStyle: "short", timeStyle: "medium" }); // as in the names of the folders
@@ -35,14 +35,14 @@ function Chooser({ link, state, mine, onEnd }) {
   }
   const busy = state !== null && state.holder !== "";
   if (busy && state.mode === "study" && mine) return html`<div class="card warning"><h2>Study</h2>
-    ${error && html`<p class="error" role="alert">${error}</p>`}<${Playing} state=${state} link=${link} say=${say} /></div>`;
+    <${Said} error=${error} /><${Playing} state=${state} link=${link} say=${say} /></div>`;
   if (busy && state.mode === "study") return html`<div class="card warning"><h2>Study</h2>
     <p class="badge live">Another page plays a study, up to ${limitOf(state)}</p><${Progress} state=${state} /></div>`;
   if (list === null) return html`<div class="card"><h2>Study</h2><p class=${error ? "error" : ""} role="status">${error || "Reading the studies …"}</p></div>`;
   const titles = list.find((one) => one.name === chosen.study)?.experiments ?? [];
   const toggle = (table, on) => change({ experiments: titles.map((one) => one.table).filter((one) => (one === table ? on : chosen.experiments.includes(one))) });
   return html`<div class="card"><h2>Study</h2>
-    ${error && html`<p class="error" role="alert">${error}</p>`}
+    <${Said} error=${error} />
     ${state?.reason && html`<p role="status">Last message of the bench: ${state.reason}</p>`}
     <label>Study <select value=${chosen.study} onChange=${(e) => pick(list, e.target.value)}>
       ${list.map((one) => html`<option value=${one.name}>${one.name}</option>`)}</select></label>
@@ -51,7 +51,8 @@ function Chooser({ link, state, mine, onEnd }) {
         onChange=${(e) => toggle(one.table, e.target.checked)} /> ${one.title} (${one.table})</label>`)}</fieldset>
     <label><input type="checkbox" checked=${chosen.quick} onChange=${(e) => change({ quick: e.target.checked })} /> Short version</label>
     <label><input type="checkbox" checked=${chosen.keep_video === "none"} onChange=${(e) => change({ keep_video: e.target.checked ? "none" : "sample" })} /> Keep no camera frames</label>
-    <div class="row"><button type="button" disabled=${checked === "checking" || chosen.experiments.length === 0} onClick=${check}>Check</button></div>
+    <div class="row"><button type="button" disabled=${checked === "checking" || chosen.experiments.length === 0} onClick=${check}>Check</button>
+      ${chosen.experiments.length === 0 && html`<span>Tick an experiment first.</span>`}</div>
     ${checked === "checking" && html`<p role="status">Checking the study against the limits of the bench …</p>`}
     ${checked !== null && checked !== "checking" && html`
       <p role="status">${!checked.rated ? "The rating of this bench is not known (the rig file has no [rating]), so the study was not checked against it."

@@ -20,6 +20,7 @@ from haselab.cli.options import shared_option
 from haselab.cli.output import OutputRule, reserved
 from haselab.cli.plot import PLOT
 from haselab.cli.readable import readable
+from haselab.cli.run_path import ACTUATOR_FILE
 from haselab.store.folder import write_text
 
 __all__ = [
@@ -134,7 +135,7 @@ def actuator_option(detail: str) -> Callable[[F], F]:
         The decorator.
     """
     text = f"{detail} Default: none."
-    return shared_option("--actuator", type=click.Path(path_type=Path), detail=text)
+    return shared_option("--actuator", type=ACTUATOR_FILE, detail=text)
 
 
 def unverified_option(function: F) -> F:

@@ -13,6 +13,7 @@ from haselab.cli.common import actuator_option, answer_options
 from haselab.cli.model.doubts import warn_doubts
 from haselab.cli.options import shared_option
 from haselab.cli.output import OutputRule
+from haselab.cli.run_path import ACTUATOR_FILE
 from haselab.cli.study.chip_run import play_on_chip
 from haselab.cli.study.study_run import (
     RUN_FOLDER,
@@ -61,7 +62,7 @@ def rig_file(path: Path) -> tuple[TwinConfig, int]:
     "--rig", type=click.Path(path_type=Path),
     detail="Default: the default instruments, around the twin of --twin.",
 )  # fmt: skip
-@shared_option("--twin", type=click.Path(path_type=Path), detail="Default: that of --rig.")
+@shared_option("--twin", type=ACTUATOR_FILE, detail="Default: that of --rig.")
 @draw_option
 @shared_option("--quick", is_flag=True, detail="The table [quick] of STUDY describes it.")
 @keep_video_option

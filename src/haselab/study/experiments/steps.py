@@ -8,7 +8,7 @@ from dataclasses import replace
 
 import numpy as np
 
-from haselab.base import InputError, ResultError
+from haselab.base import InputError, JsonObject, ResultError
 from haselab.controllers import KnownActuator
 from haselab.rig import RigDescription
 from haselab.runtime.loop import LoopSettings
@@ -17,11 +17,13 @@ from haselab.signals import constant
 from haselab.study.analysis import Analysis
 from haselab.study.definition import Study
 from haselab.study.experiment import Experiment, ExperimentResult
+from haselab.study.fits.dynamics import Dynamics
 from haselab.study.fits.further import further_trials, rows_without, saturating_reference
 from haselab.study.fits.loops import Loops, loop_saturation
 from haselab.study.fits.maps import Maps, require_open_steps
 from haselab.study.fits.observe import Observation
 from haselab.study.fits.paper_chain import PrintedChain
+from haselab.study.fits.predicted import map_errors, predicted_metrics
 from haselab.study.fits.trials import Comparison, compare_trials
 from haselab.study.own_controller import OWN, own_controller, own_names
 from haselab.study.paper.quantity_table import paper_rows
@@ -206,6 +208,7 @@ class StepTest(Experiment[Steps]):
         closed = {name: seen[group] for group, name in _COMPARED.items() if group in seen}
         found = compare_trials({"open loop": opened, **closed}, maps, self.study, scale)
         found = replace(found, failed={**lost, **found.failed})
+        found.figures["steps"].update(self._predictions(analysis, loops, found))
         further = further_trials(seen, found.groups.get("PI"), maps, loops, self.study, scale)
         reasons = {key: why for key in self.rows() if (why := found.reason(key))}
         return ExperimentResult(
@@ -215,6 +218,15 @@ class StepTest(Experiment[Steps]):
             values=(found,),
             missing={**reasons, **further.missing, **rows_without(lost)},
         )
+
+    def _predictions(self, analysis: Analysis, loops: Loops, found: Comparison) -> JsonObject:
+        """Metrics that the plant predicts, and what the strain map explains of final errors."""
+        plant = analysis.need(Dynamics).plant
+        predictions: JsonObject = {"predicted": predicted_metrics(found.groups, plant, loops)}
+        if self.settings.feedback == "capacitance":
+            closed = {name: seen for name, seen in found.groups.items() if name in ("PI", "PID")}
+            predictions["map_error"] = map_errors(closed)
+        return predictions
 
     def _closed_trials(
         self, analysis: Analysis, groups: Sequence[str]

@@ -159,7 +159,10 @@ def _shorter(fit: ActuatorFit) -> JsonObject:
     """One line for each parameter, linear model and law, in place of tables."""
     return {
         "determined_by": {
-            name: ", ".join(f"{source.text} x{source.variance_growth:.3g}" for source in sources)
+            name: ", ".join(
+                f"{source.text} (without it, {source.variance_growth:.3g} times the variance)"
+                for source in sources
+            )
             for name, sources in fit.determined_by.items()
         },
         "linear_models": {

@@ -210,7 +210,7 @@ def test_the_report_shows_what_the_design_relies_on(kind: Kind) -> None:
     slow = float(kind.recorded.rows["S20.slow_gain"]["value"])
     assert ("the opposite of creep" in page) == (slow * kind.recorded.value("S20.gain") < 0.0)
     # nothing of the paper, and nothing of the planar twin
-    assert "elative capacitance" not in page and "S15." not in page and "paper_chain" not in page
+    assert "elative capacitance" not in page and "S15." not in page and "S10." not in page
     assert "rig_config.shell" not in page and "rig_config.actuator" in page
     assert "[open, open]" not in page
 

@@ -10,6 +10,7 @@ from numpy.typing import NDArray
 
 from haselab.base import Estimate
 from haselab.control import LoopSetting, PidGains, Saturation, step_metrics
+from haselab.control.stability.margins import loop_response
 from haselab.models.plant import Plant, SlowMode
 from haselab.study.definition import builtin_study
 from haselab.study.experiments.chirp import _slow_notes
@@ -96,6 +97,27 @@ def test_worst_margins_are_no_better_than_the_nominal_ones() -> None:
     alone = _figure(plant, pi, pid, replace(setting, feedthrough_range=None), 0.0)
     for one in alone["controllers"].values():
         assert one["worst_gain_margin_db"] == one["gain_margin_db"]
+
+
+def test_the_bode_plot_of_a_loop_is_that_of_its_margins() -> None:
+    """Before, it lacked the feedthrough, so curves and crossovers did not fit together."""
+    plant = Plant(0.8, 69.0, 0.2, 0.002, (SlowMode(-0.04, 0.08),))
+    pi, pid = PidGains(0.5, 1.0), PidGains(0.0, 30.0, 0.0114, 0.005)
+    for share in (0.0, 0.274):
+        figure = _figure(plant, pi, pid, replace(LOOP, feedthrough=share), 0.1)
+        omega = figure["omega_rad_s"]
+        low = omega < 60.0  # the continuous curve has the hold as a delay alone
+        expected = np.abs(
+            loop_response(
+                plant, pid, omega[low], loop_delay_s=LOOP.measurement_delay_s,
+                rate_hz=LOOP.rate_hz, feedthrough=share,
+            )
+        )  # fmt: skip
+        drawn = figure["controllers"]["PID"]
+        assert drawn["magnitude"][low] == pytest.approx(expected, rel=0.06)
+        at = np.interp(drawn["crossover_rad_s"], omega, drawn["magnitude"])
+        # the hold attenuates by sinc(omega T / 2): 2.5 % at 77 rad/s
+        assert at == pytest.approx(1.0, abs=0.03)
 
 
 def test_a_slow_branch_of_the_other_sign_has_a_note() -> None:

@@ -184,6 +184,6 @@ PLAN = FigurePlan(
     "three points at the lower clamp), capacitance. The first cycles are excluded from the fits. "
     "B: voltage against strain, with its hysteresis loop, and the fit of two exponentials; zero "
     "strain is the chosen baseline. C: strain against capacitance: every block of the fitted "
-    "cycles (grey), and the map that the control loops use (red). D: strain measured by the "
+    "cycles (grey), and the map that the control loops use (orange-red). D: strain measured by the "
     "camera, and strain computed from capacitance with the map that the control loops use.",
 )

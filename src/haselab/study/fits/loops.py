@@ -389,10 +389,14 @@ def _figure(
     )
     open_response = plant.frequency_response(omega_rad_s)
     held = np.exp(-1j * omega_rad_s * (setting.measurement_delay_s + 0.5 / setting.rate_hz))
+    sensed = open_response
+    if share := setting.feedthrough:
+        direct = plant.static_gain * np.exp(-1j * omega_rad_s * plant.delay_s)
+        sensed = (1.0 - share) * open_response + share * direct
     variants = loop_variants(plant, setting, spread)
     controllers = {}
     for name, gains in (("PI", pi), ("PID", pid)):
-        loop = open_response * held * gains.sampled_response(omega_rad_s, setting.rate_hz)
+        loop = sensed * held * gains.sampled_response(omega_rad_s, setting.rate_hz)
         m = loop_margins(plant, gains, setting)
         every = [loop_margins(one, gains, loop_of_one) for one, loop_of_one in variants]
         controllers[name] = {

@@ -80,6 +80,6 @@ PLAN = FigurePlan(
     "Measured displacement: trials (blue, orange-red) with the standard deviation of the three "
     "tracked points as bands, their mean (light blue), the decaying oscillation alone (dotted) "
     "and with an exponential creep term (dashed), and the exponential envelopes of the positive "
-    "(green) and the negative (purple) peaks (triangles). The envelopes are least-squares fits to the "
-    "logarithms of the peaks, if at least two peaks exceed the creep.",
+    "(green) and the negative (purple) peaks (triangles). The envelopes are least-squares fits to "
+    "the logarithms of the peaks, if at least two peaks exceed the creep.",
 )

@@ -28,7 +28,8 @@ class _InRun(click.Path):
         Raises:
             InputError: a folder without any of the files.
         """
-        path = Path(super().convert(value, param, ctx))
+        path = super().convert(value, param, ctx)
+        assert isinstance(path, Path)
         if not path.is_dir():
             return path
         for name in self.names:

@@ -8,7 +8,7 @@ from dataclasses import replace
 
 import numpy as np
 
-from haselab.base import InputError, JsonObject, ResultError
+from haselab.base import InputError, JsonObject, ResultError, table_at
 from haselab.controllers import KnownActuator
 from haselab.rig import RigDescription
 from haselab.runtime.loop import LoopSettings
@@ -208,13 +208,17 @@ class StepTest(Experiment[Steps]):
         closed = {name: seen[group] for group, name in _COMPARED.items() if group in seen}
         found = compare_trials({"open loop": opened, **closed}, maps, self.study, scale)
         found = replace(found, failed={**lost, **found.failed})
-        found.figures["steps"].update(self._predictions(analysis, loops, found))
+        predictions = self._predictions(analysis, loops, found)
         further = further_trials(seen, found.groups.get("PI"), maps, loops, self.study, scale)
         reasons = {key: why for key in self.rows() if (why := found.reason(key))}
         return ExperimentResult(
             {**found.quantities, **further.quantities},
             {**found.notes, **further.notes},
-            figures={**found.figures, **further.figures},
+            figures={
+                **found.figures,
+                **further.figures,
+                "steps": {**table_at(found.figures, "steps"), **predictions},
+            },
             values=(found,),
             missing={**reasons, **further.missing, **rows_without(lost)},
         )

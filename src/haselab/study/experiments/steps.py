@@ -17,13 +17,13 @@ from haselab.signals import constant
 from haselab.study.analysis import Analysis
 from haselab.study.definition import Study
 from haselab.study.experiment import Experiment, ExperimentResult
+from haselab.study.experiments.predicted import map_errors, predicted_metrics
 from haselab.study.fits.dynamics import Dynamics
 from haselab.study.fits.further import further_trials, rows_without, saturating_reference
 from haselab.study.fits.loops import Loops, loop_saturation
 from haselab.study.fits.maps import Maps, require_open_steps
 from haselab.study.fits.observe import Observation
 from haselab.study.fits.paper_chain import PrintedChain
-from haselab.study.fits.predicted import map_errors, predicted_metrics
 from haselab.study.fits.trials import Comparison, compare_trials
 from haselab.study.own_controller import OWN, own_controller, own_names
 from haselab.study.paper.quantity_table import paper_rows

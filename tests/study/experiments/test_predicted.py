@@ -14,8 +14,8 @@ from haselab.control.stability.margins import loop_response
 from haselab.models.plant import Plant, SlowMode
 from haselab.study.definition import builtin_study
 from haselab.study.experiments.chirp import _slow_notes
+from haselab.study.experiments.predicted import map_errors, predicted_metrics
 from haselab.study.fits.loops import Loops, _figure
-from haselab.study.fits.predicted import map_errors, predicted_metrics
 from haselab.study.fits.trials import Trials
 
 STEPS = builtin_study().steps

@@ -14,7 +14,7 @@ F = TypeVar("F", bound=Callable[..., Any])
 OTHER_SIGN = "a minus before the name (-Laser) changes the sign"
 # option: (metavar, None for click's own; what it does)
 _SHARED: dict[str, tuple[str | None, str]] = {
-    "--actuator": ("A.toml", "Use this actuator file."),
+    "--actuator": ("A.toml", "Use this actuator file, or that in the folder of a run."),
     "--ampere-per-monitor-volt": (None, "Set the scale of the current monitor in A/V."),
     "--at-rest": (None, "Assume that each record starts at rest."),
     "--blank-s": (None, "Ignore this time after each step of the output, in s."),
@@ -82,7 +82,8 @@ _SHARED: dict[str, tuple[str | None, str]] = {
     "--to": (None, "Choose the output format."),
     "--twin": (
         "FILE.toml",
-        "Use the twin of this TWIN.toml, or of the identified actuator of this actuator file.",
+        "Use the twin of this TWIN.toml, or of the identified actuator of this actuator file (or "
+        "folder of a run).",
     ),
     "--v": ("COLUMN", f"Name the column of the voltage monitor, in V; {OTHER_SIGN}."),
     "--volt-per-monitor-volt": (None, "Set the scale of the voltage monitor in V/V."),

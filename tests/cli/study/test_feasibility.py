@@ -236,6 +236,27 @@ def test_the_quick_tables_are_checked_without_quick(
     assert stop.value.code == 0
 
 
+@pytest.mark.parametrize(
+    ("more", "is_said"),
+    [("", True), ("[quick]\n", True), ("[quick.triangle]\ncycles = 4\n", False)],
+)
+def test_a_quick_run_of_a_study_without_a_quick_form_says_that_all_of_it_is_played(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str], more: str, is_said: bool
+) -> None:
+    """Here the bench refuses the study afterwards, so that the test is short."""
+    study, rig = tmp_path / "study.toml", tmp_path / "rig.toml"
+    rig.write_text('kind = "twin"\n')
+    study.write_text(TRIANGLE.replace("high_v = 2.0", "high_v = 9.0") + more)
+    words = ["run", str(study), "--rig", str(rig), "--quick", "--out", str(tmp_path / "out")]
+    with pytest.raises(SystemExit) as stop:
+        main(words)
+    lines = capsys.readouterr().err.splitlines()
+    assert stop.value.code == 2 and len(lines) == 1 + is_said
+    said = "haselab: --quick changes nothing, because the study has no table [quick]"
+    assert lines[0].startswith(said) == is_said
+    assert not is_said or "Add [quick.triangle] with the keys of [triangle]" in lines[0]
+
+
 @pytest.mark.parametrize("high_v", [0.5, 2.0, 10.0])
 def test_a_triangle_with_just_enough_frames_is_feasible(tmp_path: Path, high_v: float) -> None:
     text = TRIANGLE.replace("high_v = 2.0", f"high_v = {high_v}")

@@ -16,6 +16,7 @@ from haselab.cli.common import LIMIT, REAL, answer_options, emit
 from haselab.cli.identify.plan_for_actuator import plan_for_actuator
 from haselab.cli.options import shared_option
 from haselab.cli.plot import save_plot
+from haselab.cli.run_path import MODEL_FILE
 from haselab.cli.study.run import rig_file
 from haselab.identify.experiment_design.drives import BenchLimits
 from haselab.identify.experiment_design.plan import (
@@ -43,7 +44,7 @@ _OF_SIGNAL = (
 
 
 @click.command("plan-experiment")
-@click.argument("model", type=click.Path(path_type=Path))
+@click.argument("model", type=MODEL_FILE)
 @shared_option(
     "--rig", type=click.Path(path_type=Path),
     detail="Default: none; MODEL is then an actuator file with [model.physical].",

@@ -35,6 +35,7 @@ from haselab.cli.model.physical_comparison import (
 from haselab.cli.model.physical_model import has_physical_model
 from haselab.cli.options import shared_option
 from haselab.cli.plot import save_plot
+from haselab.cli.run_path import MODEL_FILE
 from haselab.identify.fit import Prediction
 from haselab.identify.prediction import note_range, predict
 from haselab.identify.record import HOLDS, Record
@@ -63,7 +64,7 @@ _NO_NOISE = (
 
 
 @click.command("compare")
-@click.argument("model", type=click.Path(path_type=Path))
+@click.argument("model", type=MODEL_FILE)
 @FILES
 @shared_option(
     "--input",
@@ -138,11 +139,11 @@ def command(
 ) -> None:
     """Predict records in FILES that were not used for the fit of MODEL.
 
-    MODEL is an actuator file or a model.json. With the physical model of 'identify actuator', FILES
-    are sessions, folders of runs, or tables with a voltage and a length, strain or capacitance. The
-    command simulates the model with the recorded voltage and compares experiment by experiment. The
-    exit code is 3 if the error is larger than the band explains, or if the model was identified
-    from one of the files.
+    MODEL is an actuator file, the folder of a run, or a model.json. With the physical model of
+    'identify actuator', FILES are sessions, folders of runs, or tables with a voltage and a length,
+    strain or capacitance. The command simulates the model with the recorded voltage and compares
+    experiment by experiment. The exit code is 3 if the error is larger than the band explains, or
+    if the model was identified from one of the files.
 
     With any other model, such as that of 'identify transfer' or 'identify arx', FILES are tables.
     The command reports the fit in percent, the rms error and the share of samples inside the 95 %

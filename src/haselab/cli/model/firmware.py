@@ -15,6 +15,7 @@ from haselab.cli.common import REAL, SEED, Real, answer_options, emit
 from haselab.cli.model.doubts import warn_doubts
 from haselab.cli.options import shared_option
 from haselab.cli.output import OutputRule
+from haselab.cli.run_path import ACTUATOR_FILE
 from haselab.cli.study.twin_option import draw_option, name_origin, twin_of_options
 from haselab.control import PidGains, Saturation
 from haselab.control.reach import default_step
@@ -203,7 +204,7 @@ def _say_narrowed(settings: ChipSettings, designed: tuple[float, float], run: Pa
 @click.argument("run", type=click.Path(path_type=Path))
 @_structure
 @_source
-@shared_option("--twin", type=click.Path(path_type=Path), detail="Default: see --reading.")
+@shared_option("--twin", type=ACTUATOR_FILE, detail="Default: see --reading.")
 @draw_option
 @shared_option(
     "--reading", type=click.Choice(["rad", "hz"]),

@@ -13,9 +13,9 @@ COLUMNS = 80
 VERBS = {
     "Acknowledge", "Add", "Apply", "Assume", "Average", "Check", "Choose", "Compare", "Compile",
     "Compute", "Convert", "Correct", "Describe", "Draw", "Estimate", "Export", "Find", "Fit", "Fix",
-    "Forecast", "Identify", "Ignore", "Keep", "Leave", "Limit", "Move", "Name", "Play", "Print",
-    "Read", "Record", "Refuse", "Require", "Serve", "Set", "Show", "Simulate", "Skip", "State",
-    "Subtract", "Treat", "Use", "Write",
+    "Forecast", "Identify", "Ignore", "Keep", "Leave", "Limit", "Move", "Name", "Permit", "Play",
+    "Print", "Read", "Record", "Refuse", "Require", "Serve", "Set", "Show", "Simulate", "Skip",
+    "State", "Subtract", "Treat", "Use", "Write",
 }  # fmt: skip
 # The end of an option's name, and how its help states the unit.
 UNITS = {

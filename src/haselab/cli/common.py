@@ -73,17 +73,29 @@ class _Limit(Real):
 
 
 class _Integer(click.IntRange):
-    """A whole number whose range is checked, with a better message, by the function it goes to."""
+    """A whole number whose range is checked, with a better message, by the function it goes to.
+
+    --help shows INTEGER; the help text of the option states the range.
+    """
+
+    name = "integer"
 
     def _describe_range(self) -> str:
         return ""
+
+
+class _Seed(click.IntRange):
+    """A seed. Its upper limit is so large that --help states the lower one only."""
+
+    def _describe_range(self) -> str:
+        return f"x>={self.min}"
 
 
 REAL = Real()
 LIMIT = _Limit(0.0, min_open=True)
 POSITIVE = Real(0.0, min_open=True)
 INTEGER = _Integer(-(10**9), 10**9)
-SEED = click.IntRange(0, 2**63 - 1)
+SEED = _Seed(0, 2**63 - 1)
 WORKERS = click.IntRange(1, 256)
 
 
@@ -92,7 +104,7 @@ def answer_options(
     out_detail: str = "It is a JSON file. Default: none.",
     *,
     plot: bool = False,
-    force_detail: str = "Without this option, the command refuses to write.",
+    force_detail: str = "Without this option, the command refuses to run if the result exists.",
 ) -> Callable[[F], F]:
     """Add `--json`, `--out`, `--force` and `--debug` (passed on as `as_json`, `out`, `debug`).
 

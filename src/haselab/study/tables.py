@@ -169,8 +169,8 @@ class Steps(Section):
     open_trials: int = Field(
         ge=0,
         le=1000,
-        description="trials in open loop; 0 only without [chirp], for a step that only the "
-        "controller of custom_trials reaches",
+        description="trials in open loop; at least 1 if the study has [chirp]; 0 is for a step "
+        "that only the controller of custom_trials reaches",
         examples=[2],
     )
     pi_trials: int = Field(ge=0, le=1000, description="trials with the PI", examples=[2])

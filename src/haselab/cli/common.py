@@ -87,6 +87,13 @@ class _Integer(click.IntRange):
 class _Seed(click.IntRange):
     """A seed. Its upper limit is so large that --help states the lower one only."""
 
+    def convert(self, value: Any, param: click.Parameter | None, ctx: click.Context | None) -> int:
+        """Return the seed, or raise `BadParameter` if the value is none."""
+        number = int(click.INT.convert(value, param, ctx))
+        if self.max is not None and number > self.max:
+            self.fail(f"{number} is too large. Use at most {self.max}.", param, ctx)
+        return int(super().convert(number, param, ctx))
+
     def _describe_range(self) -> str:
         return f"x>={self.min}"
 

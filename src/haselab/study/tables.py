@@ -96,7 +96,8 @@ class StaticLoad(Section):
 
     masses_kg: tuple[float, ...] = Field(
         max_length=1000,
-        description=f"masses in the order in which they are hung, at least {LEAST_LOADS} different ones",
+        description="masses in the order in which they are hung, at least "
+        f"{LEAST_LOADS} different ones",
         examples=[[0.0, 0.1, 0.2, 0.3, 0.4, 0.5, 0.6]],
     )
     settle_s: float = Field(

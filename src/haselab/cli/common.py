@@ -78,17 +78,36 @@ class _Limit(Real):
 
 
 class _Integer(click.IntRange):
-    """A whole number whose range is checked, with a better message, by the function it goes to."""
+    """A whole number whose range is checked, with a better message, by the function it goes to.
+
+    --help shows INTEGER; the help text of the option states the range.
+    """
+
+    name = "integer"
 
     def _describe_range(self) -> str:
         return ""
+
+
+class _Seed(click.IntRange):
+    """A seed. Its upper limit is so large that --help states the lower one only."""
+
+    def convert(self, value: Any, param: click.Parameter | None, ctx: click.Context | None) -> int:
+        """Return the seed, or raise `BadParameter` if the value is none."""
+        number = int(click.INT.convert(value, param, ctx))
+        if self.max is not None and number > self.max:
+            self.fail(f"{number} is too large. Use at most {self.max}.", param, ctx)
+        return int(super().convert(number, param, ctx))
+
+    def _describe_range(self) -> str:
+        return f"x>={self.min}"
 
 
 REAL = Real()
 LIMIT = _Limit(0.0, min_open=True)
 POSITIVE = Real(0.0, min_open=True)
 INTEGER = _Integer(-(10**9), 10**9)
-SEED = click.IntRange(0, 2**63 - 1)
+SEED = _Seed(0, 2**63 - 1)
 WORKERS = click.IntRange(1, 256)
 
 
@@ -97,7 +116,7 @@ def answer_options(
     out_detail: str = "It is a JSON file. Default: none.",
     *,
     plot: bool = False,
-    force_detail: str = "Without this option, the command refuses to write.",
+    force_detail: str = "Without this option, the command refuses to run if the result exists.",
 ) -> Callable[[F], F]:
     """Add `--json`, `--out`, `--force` and `--debug` (passed on as `as_json`, `out`, `debug`).
 

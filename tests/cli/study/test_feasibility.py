@@ -126,7 +126,7 @@ def test_a_bench_that_was_made_safe_is_armed_only_after_its_reason_was_acknowled
     monkeypatch.setattr(click, "confirm", lambda words, err: bool(asked.append(words)))
     for operator in (None, Operator(), Operator(yes=True)):
         with (
-            pytest.raises(SafetyError, match=r"The bench was made safe(: |\. Reason: )Smoke \(on "),
+            pytest.raises(SafetyError, match=r"was revoked(: |\. Reason: )Smoke \(on "),
             armed_rig(plain, file, path, study, tmp_path, operator),
         ):
             raise AssertionError("must not be entered")

@@ -70,8 +70,8 @@ _TABLE_CLOCK = 1e-3  # relative standard deviation of their times: 30 frames/s a
               help="Set the starting value of the added inertia in kg: of what moves but does not "
               "load the actuator, such as a lever. Default: 5 % of the hung mass.")  # fmt: skip
 @click.option("--zero-std-m", type=POSITIVE,
-              help="Set the standard deviation of the zero of the lengths in m. Default: 5e-5 with "
-              "tables, 2e-6 without.")  # fmt: skip
+              help="Set the uncertainty (one standard deviation) of the zero of the lengths, in m. "
+              "Default: 5e-5 with tables, 2e-6 without.")  # fmt: skip
 @unverified_option
 @column_options
 @answer_options(plot=True)

@@ -68,7 +68,7 @@ _OF_SIGNAL = (
 )
 @click.option(
     "--baseline-v", type=REAL, default=1.0, show_default=True,
-    help="Set the drive at the start, in V.",
+    help="Set the baseline drive, at which the actuator has settled at the start, in V; above 0 V.",
 )  # fmt: skip
 @shared_option(
     "--capacitance-f", type=REAL, default=1e-9, show_default=True, detail="Include the cable."
@@ -83,7 +83,7 @@ _OF_SIGNAL = (
 )  # fmt: skip
 @click.option(
     "--samples-per-s", type=REAL, default=2.0, show_default=True,
-    help="Set how many independent samples of the output a second contains.",
+    help="Set the number of statistically independent output samples per second.",
 )  # fmt: skip
 @click.option(
     "--systematic", type=REAL, default=0.05, show_default=True,

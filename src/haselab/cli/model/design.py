@@ -102,9 +102,9 @@ class _DesignCommand(click.Command):
 )  # fmt: skip
 @loop_options
 @click.option(
-    "--limits", type=(REAL, REAL), show_default="those in the actuator file, else -0.05 0.1",
-    metavar="LOW HIGH",
-    help="Limit the controller's output to this range, in the unit of the model's input.",
+    "--limits", type=(REAL, REAL), metavar="LOW HIGH",
+    help="Limit the controller's output to this range, in the unit of the model's input. Default: "
+    "the limits in the actuator file, else -0.05 0.1.",
 )  # fmt: skip
 @shared_option("--seed", type=SEED, default=0, show_default=True)
 @click.option(

@@ -6,6 +6,7 @@ import click
 import pytest
 from click.testing import CliRunner
 
+from haselab.cli.common import SEED
 from haselab.cli.main import cli
 
 COLUMNS = 80
@@ -13,9 +14,9 @@ COLUMNS = 80
 VERBS = {
     "Acknowledge", "Add", "Apply", "Assume", "Average", "Check", "Choose", "Compare", "Compile",
     "Compute", "Convert", "Correct", "Describe", "Draw", "Estimate", "Export", "Find", "Fit", "Fix",
-    "Forecast", "Identify", "Ignore", "Keep", "Leave", "Limit", "Move", "Name", "Play", "Print",
-    "Read", "Record", "Refuse", "Require", "Serve", "Set", "Show", "Simulate", "Skip", "State",
-    "Subtract", "Treat", "Use", "Write",
+    "Forecast", "Identify", "Ignore", "Keep", "Leave", "Limit", "Move", "Name", "Permit", "Play",
+    "Print", "Read", "Record", "Refuse", "Require", "Serve", "Set", "Show", "Simulate", "Skip",
+    "State", "Subtract", "Treat", "Use", "Write",
 }  # fmt: skip
 # The end of an option's name, and how its help states the unit.
 UNITS = {
@@ -107,6 +108,22 @@ def test_the_help_of_an_option_starts_with_a_verb_and_has_default_and_unit(
     ends = [end for end in UNITS if name.endswith(end)]
     if takes_value and ends and name not in PER_SECOND:
         assert UNITS[max(ends, key=len)] in text, f"{path} {name}: {text}"
+
+
+@pytest.mark.parametrize(
+    ("path", "option"), OPTIONS, ids=lambda each: str(getattr(each, "name", each))
+)
+def test_the_help_of_an_option_states_a_range_that_helps(path: str, option: click.Option) -> None:
+    text = _text(option)
+    assert "9223372036854775807" not in text, f"{path} {_name(option)}: {text}"
+    assert "[default: (" not in text, f"{path} {_name(option)}: {text}"
+
+
+def test_a_seed_outside_its_range_is_refused_with_the_limit() -> None:
+    for value, limit in (("-1", "x>=0"), (str(2**63), "Use at most 9223372036854775807")):
+        with pytest.raises(click.BadParameter, match=limit):
+            SEED.convert(value, None, None)
+    assert SEED.convert(str(2**63 - 1), None, None) == 2**63 - 1
 
 
 def test_an_option_means_the_same_in_every_command() -> None:

@@ -114,7 +114,7 @@ def test_a_bench_can_be_armed_again_after_stop_has_reset_its_board(
                     assert page.state["stage"] == "tripped" and page.state["mode"] == "idle"
                     reason = page.state["reason"]
                     # `rig safe` may be first, or reset the board while its output is read back.
-                    causes = ("STOP was pressed", "made the bench safe", "reserved by a program")
+                    causes = ("STOP was pressed", "took the bench to 0 V", "reserved by a program")
                     assert any(cause in reason for cause in causes), reason
                     assert abs(served.hub.output_v) < 50.0
                     assert "error" in await page.ask("drive", value_v=1.0)

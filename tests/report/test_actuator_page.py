@@ -142,3 +142,72 @@ def test_an_actuator_of_a_simulated_run_is_marked(
     path.write_text(f"[actuator]\nname = 'leg'\n{origin}")
     report(capsys, path)
     assert "<h1>SIMULATED: leg</h1>" in (tmp_path / "leg-report.html").read_text()
+
+
+PHYSICAL = """
+[actuator]
+name = "leg"
+kind = "peano-hasel"
+[model.physical]
+kind = "peano-hasel"
+status = "ok"
+mass_kg = 0.1
+not_identifiable = ["actuator.film_stiffness_n_per_m"]
+[model.physical.parameters]
+"actuator.pouch_length_m" = 0.02
+"actuator.film_stiffness_n_per_m" = 25000.0
+"actuator.branch_relaxation_s[0]" = 1.0
+"camera.offset_m" = 1e-6
+[model.physical.measured]
+"actuator.pouches" = 5.0
+[model.physical.std]
+"actuator.pouch_length_m" = 0.0001
+"actuator.film_stiffness_n_per_m" = inf
+"actuator.branch_relaxation_s[0]" = 0.3
+"camera.offset_m" = 2e-6
+[model.physical.determined_by]
+"actuator.pouch_length_m" = ["triangle capacitance", "static length"]
+[model.physical.covariance]
+names = ["actuator.pouch_length_m", "actuator.branch_relaxation_s[0]", "camera.offset_m"]
+matrix = [[1e-8, 0, 0], [0, 0.09, 0], [0, 0, 4e-12]]
+[model.physical.residuals]
+length_noise_m = 2e-6
+length_rms_m = 3e-6
+"""
+
+
+def test_the_physical_model_has_intervals_and_what_determines_them_instead_of_its_covariance(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    path = tmp_path / "leg.toml"
+    path.write_text(PHYSICAL)
+    report(capsys, path)
+    page = (tmp_path / "leg-report.html").read_text()
+    assert "std." not in page and "matrix" not in page and "physical.parameters" not in page
+    rows = {
+        cells[0]: cells[1:]
+        for cells in (
+            [re.sub("<[^>]+>", "", cell).strip() for cell in re.findall(r"<t[hd].*?</t[hd]>", row)]
+            for row in re.findall(r"<tr>.*?</tr>", page, re.DOTALL)
+        )
+    }
+    # 0.02 (1 +- 1.96 * 0.005) m
+    assert rows["actuator.pouch_length_m"] == [
+        "0.02000", "[0.01980, 0.02020]", "m", "triangle capacitance, static length"
+    ]  # fmt: skip
+    assert rows["actuator.film_stiffness_n_per_m"][:3] == ["25000", "—", "N/m"]
+    low, high = np.exp([-0.3 * 1.96, 0.3 * 1.96])  # a time is positive
+    assert rows["actuator.branch_relaxation_s[0]"][:3] == ["1.00", f"[{low:.2f}, {high:.2f}]", "s"]
+    assert rows["camera.offset_m"][1:3] == ["[−2.9, 4.9]×10⁻⁶", "m"]  # may be negative
+    assert rows["actuator.pouches"][:2] == ["5", "stated, not fitted"]
+    assert rows["residuals of the length, rms"][0] == "3×10⁻⁶, of which noise 2×10⁻⁶"
+    assert "without which the variance of this parameter" in page
+
+
+def test_a_file_without_a_physical_model_has_no_section_of_it(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    path = tmp_path / "leg.toml"
+    path.write_text('[actuator]\nname = "leg"\n')
+    report(capsys, path)
+    assert "Physical model" not in (tmp_path / "leg-report.html").read_text()

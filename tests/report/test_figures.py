@@ -13,6 +13,7 @@ from haselab.report.results import Results
 from haselab.report.style import figure_style
 
 UNITS = {"px", "mm", "%", "1", "V", "kV", "s", "nF", "a.u.", "N", "rad/s", "Hz", "dB", "°"}
+UNITS |= {"0 to 1"}  # range of a quantity without unit, such as the coherence
 PANELS = [(plan, panel) for plan in PLANS for panel in plan.panels]
 NAMES = [f"{plan.name}{panel.letter}" for plan, panel in PANELS]
 

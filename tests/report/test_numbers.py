@@ -61,6 +61,14 @@ def test_an_end_that_is_not_finite_reads_as_open():
     assert interval_text(3.0, 0.5, (2.0, None)) == ("3.00", "[2.00, open]")
 
 
+@pytest.mark.parametrize("std", [0.5, math.nan, None])
+def test_an_interval_without_ends_is_a_dash(std):
+    """Before, it was "[open, open]", which no one could read."""
+    assert interval_text(3.0, std, (None, math.inf))[1] == "—"
+    text = value_text({"value": 3.0, "std": std, "ci95": [None, None], "unit": "m"})
+    assert text in ("3 m", "3.00 m")
+
+
 def test_an_uncertain_zero_takes_its_scale_from_the_uncertainty():
     assert interval_text(1e-9, 0.1, (-0.2, 0.2)) == ("0.00", "[−0.20, 0.20]")
 

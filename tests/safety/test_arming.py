@@ -84,7 +84,7 @@ def test_a_trip_latches_its_first_reason_until_a_new_arming(twin: TwinBench) -> 
         rig.source.write(0.5)
     request = rig.safety.request()
     assert request.reason.startswith("Smoke (on ")
-    with pytest.raises(SafetyError, match=r"made safe: Smoke \(on .*acknowledge this reason"):
+    with pytest.raises(SafetyError, match=r"was revoked: Smoke \(on .*acknowledge this reason"):
         rig.safety.arm(request)
     with pytest.raises(SafetyError, match=r"Arm the bench|is tripped"):
         rig.source.write(0.5)

@@ -119,7 +119,7 @@ def test_nothing_is_requested_without_a_permission_nor_after_its_end(gate, reque
     permit(gate)
     request_output(wrapped)
     gate.interlock.revoke("Smoke.")
-    with pytest.raises(SafetyError, match=r"made safe: Smoke \(on "):
+    with pytest.raises(SafetyError, match=r"was revoked: Smoke \(on "):
         request_output(wrapped)
     wrapped.read()
     assert (driver.output_v, driver.requested_v, driver.carrier_v) == (0.0, 0.0, 0.0)

@@ -52,7 +52,7 @@ def test_a_result_that_is_awaited_does_not_take_the_first_answer(
     assert not starting.is_alive() and 0 not in guardians.pids
     guardians.make_safe("test")
     waiting.join(20.0)
-    assert answers == [""] and "made the bench safe" in guardians.lost()
+    assert answers == [""] and "took the bench to 0 V" in guardians.lost()
     guardians.close()
 
 

@@ -189,6 +189,41 @@ def test_the_feedthrough_of_the_chirp_is_that_of_the_law(kind: Kind) -> None:
         assert table.feedthrough_std == pytest.approx(row["std"])
 
 
+def test_the_predicted_step_of_the_pid_is_the_played_one_but_for_the_strain_map(kind: Kind) -> None:
+    """The camera sees the error of the map, which the controller cannot."""
+    steps = json.loads((kind.folder / "analysis.json").read_text())["steps"]
+    predicted, played = steps["predicted"]["PID"], steps["metrics"]["PID"]
+    left = played["error"]["value"] - steps["map_error"]["PID"]
+    assert left == pytest.approx(predicted["error"], abs=STD * played["error"]["std"])
+    frame_s = 1.0 / kind.recorded.study["steps"]["frame_rate_hz"]
+    # one frame at either end, and a tenth for a plant that is not linear
+    assert played["rise_time_s"]["value"] == pytest.approx(
+        predicted["rise_time_s"], abs=2.0 * frame_s, rel=0.1
+    )
+    assert played["overshoot"]["value"] == pytest.approx(predicted["overshoot"], abs=0.05)
+
+
+def test_the_report_shows_what_the_design_relies_on(kind: Kind) -> None:
+    page = (kind.folder / "report.html").read_text()
+    assert "Worst phase margin (°)" in page and "Predicted and played steps" in page
+    assert ("The margins contain a feedthrough of" in page) == (kind.twin.kind != "dea-stack")
+    slow = float(kind.recorded.rows["S20.slow_gain"]["value"])
+    assert ("the opposite of creep" in page) == (slow * kind.recorded.value("S20.gain") < 0.0)
+    # nothing of the paper, and nothing of the planar twin
+    assert "elative capacitance" not in page and "S15." not in page and "S10." not in page
+    assert "rig_config.shell" not in page and "rig_config.actuator" in page
+    assert "[open, open]" not in page
+
+
+def test_an_interval_of_no_width_is_that_of_a_setting_or_a_designed_gain(kind: Kind) -> None:
+    exact = {
+        key for key, row in kind.recorded.rows.items()
+        if row["ci95"][0] is not None and row["ci95"][0] == row["ci95"][1]
+    }  # fmt: skip
+    known = ("S18.baseline", "S21.delay", "S22.saturation_", "S25.k", "S25.derivative_filter")
+    assert all(key.startswith(known) for key in exact), exact
+
+
 def test_what_does_not_apply_is_not_determined_for_a_true_reason(kind: Kind) -> None:
     results = json.loads((kind.folder / "results.json").read_text())
     reasons = {key: part["reason"] for part in results["not_played"] for key in part["ids"]}

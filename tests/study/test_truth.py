@@ -13,6 +13,8 @@ from typing import Any
 import pytest
 
 import haselab
+from haselab.rig.twin.config import PLANAR_SECTIONS, TwinConfig
+from haselab.study.simulated.truth import twin_of, used_configuration
 
 SOURCE = Path(haselab.__file__).parent
 ROOMS = ("signals", "models", "sensing", "identify", "control", "tracking", "runtime", "report")
@@ -128,3 +130,16 @@ def test_a_dielectric_of_higher_permittivity_is_seen_as_more_capacitance(
     expected = 3.0 / 3.5 * (length_m("hz") / length_m("other")) ** 3.33
     expected *= secant("other") / secant("hz")
     assert other / usual == pytest.approx(expected, rel=0.03)
+
+
+def test_the_provenance_of_another_kind_has_no_parts_of_the_planar_twin() -> None:
+    peano = TwinConfig(kind="peano-hasel").model_dump(mode="json")
+    used = used_configuration(peano)
+    assert set(peano) - set(used) == {*PLANAR_SECTIONS, "reading"}
+    assert {"actuator", "load", "amplifier", "acquisition", "camera"} <= set(used)
+    again = twin_of(used)  # 'firmware simulate' finds the twin of a run there
+    assert again is not None and again.model_dump(mode="json") == peano
+    planar = TwinConfig().model_dump(mode="json")
+    assert used_configuration(planar) == planar
+    for other in ({}, {"kind": "bench", "daq": {}}):
+        assert twin_of(other) is None and used_configuration(other) == other

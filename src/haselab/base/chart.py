@@ -94,6 +94,7 @@ class Panel:
         log_x: the abscissa is logarithmic.
         log_y: the ordinate is logarithmic.
         ticks: names of 0, 1, 2 ... on the abscissa, for bars.
+        y_limits: ends of the ordinate; None: those of the curves.
     """
 
     x_label: str
@@ -102,6 +103,7 @@ class Panel:
     log_x: bool = False
     log_y: bool = False
     ticks: Sequence[str] = ()
+    y_limits: tuple[float, float] | None = None
 
 
 @dataclass(frozen=True)

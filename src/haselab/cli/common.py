@@ -7,8 +7,10 @@ import json
 import math
 import os
 import sys
+import threading
+import time
 from collections.abc import Callable, Iterator, Mapping
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from dataclasses import replace
 from pathlib import Path
 from typing import Any, TypeVar
@@ -20,6 +22,7 @@ from haselab.cli.options import shared_option
 from haselab.cli.output import OutputRule, reserved
 from haselab.cli.plot import PLOT
 from haselab.cli.readable import readable
+from haselab.cli.run_path import ACTUATOR_FILE
 from haselab.store.folder import write_text
 
 __all__ = [
@@ -40,6 +43,8 @@ __all__ = [
 ]
 
 _LARGEST = 1e30
+_SHORTEST_S = 10.0  # between two lines about one step
+_LINES_IN_A_MINUTE = 6
 F = TypeVar("F", bound=Callable[..., Any])
 
 
@@ -73,17 +78,36 @@ class _Limit(Real):
 
 
 class _Integer(click.IntRange):
-    """A whole number whose range is checked, with a better message, by the function it goes to."""
+    """A whole number whose range is checked, with a better message, by the function it goes to.
+
+    --help shows INTEGER; the help text of the option states the range.
+    """
+
+    name = "integer"
 
     def _describe_range(self) -> str:
         return ""
+
+
+class _Seed(click.IntRange):
+    """A seed. Its upper limit is so large that --help states the lower one only."""
+
+    def convert(self, value: Any, param: click.Parameter | None, ctx: click.Context | None) -> int:
+        """Return the seed, or raise `BadParameter` if the value is none."""
+        number = int(click.INT.convert(value, param, ctx))
+        if self.max is not None and number > self.max:
+            self.fail(f"{number} is too large. Use at most {self.max}.", param, ctx)
+        return int(super().convert(number, param, ctx))
+
+    def _describe_range(self) -> str:
+        return f"x>={self.min}"
 
 
 REAL = Real()
 LIMIT = _Limit(0.0, min_open=True)
 POSITIVE = Real(0.0, min_open=True)
 INTEGER = _Integer(-(10**9), 10**9)
-SEED = click.IntRange(0, 2**63 - 1)
+SEED = _Seed(0, 2**63 - 1)
 WORKERS = click.IntRange(1, 256)
 
 
@@ -92,7 +116,7 @@ def answer_options(
     out_detail: str = "It is a JSON file. Default: none.",
     *,
     plot: bool = False,
-    force_detail: str = "Without this option, the command refuses to write.",
+    force_detail: str = "Without this option, the command refuses to run if the result exists.",
 ) -> Callable[[F], F]:
     """Add `--json`, `--out`, `--force` and `--debug` (passed on as `as_json`, `out`, `debug`).
 
@@ -134,7 +158,7 @@ def actuator_option(detail: str) -> Callable[[F], F]:
         The decorator.
     """
     text = f"{detail} Default: none."
-    return shared_option("--actuator", type=click.Path(path_type=Path), detail=text)
+    return shared_option("--actuator", type=ACTUATOR_FILE, detail=text)
 
 
 def unverified_option(function: F) -> F:
@@ -196,9 +220,13 @@ class _BarProgress:
         )
         self._task = self._bar.add_task(waits_for or "", total=None)
 
-    def wait(self) -> None:
+    def begin(self) -> None:
         """Show the bar until `stop`."""
         self._bar.start()
+
+    def stage(self, what: str) -> None:
+        """Name the present stage of the step."""
+        self._bar.update(self._task, description=what)
 
     def start(self, total: float) -> None:
         """Show the bar for a job of `total` units."""
@@ -229,19 +257,57 @@ def _is_watched() -> bool:
     return sys.stderr.isatty() and "JPY_PARENT_PID" not in os.environ
 
 
+class _Lines:
+    """Lines on stderr about a step of unknown length: none before 10 s, then seldom."""
+
+    def __init__(self, what: str) -> None:
+        self._what = self._stage = self._said = what
+        self._began_s = time.monotonic()
+        self._ended = threading.Event()
+        self._thread = threading.Thread(target=self._watch, daemon=True)
+
+    def begin(self) -> None:
+        """Begin to watch the time."""
+        self._thread.start()
+
+    def stage(self, what: str) -> None:
+        """Name the present stage in the lines that follow."""
+        self._stage = what
+
+    def stop(self) -> None:
+        """Print nothing more."""
+        self._ended.set()
+        self._thread.join()
+
+    def _watch(self) -> None:
+        """Print a line when the stage is another one, and at least once a minute."""
+        silent = _LINES_IN_A_MINUTE  # the first line comes at once
+        while not self._ended.wait(_SHORTEST_S):
+            silent += 1
+            if self._stage != self._said or silent >= _LINES_IN_A_MINUTE:
+                taken_s = time.monotonic() - self._began_s
+                said = "" if self._stage == self._what else f": {self._stage}"
+                with suppress(OSError, ValueError):  # stderr is closed: the step goes on
+                    click.echo(f"haselab: {self._what}{said} ({taken_s:.0f} s so far)", err=True)
+                self._said, silent = self._stage, 0
+
+
 @contextmanager
-def waiting(what: str) -> Iterator[None]:
-    """Show that a step of unknown length goes on, where `progress_bar` shows a bar.
+def waiting(what: str) -> Iterator[Callable[[str], None]]:
+    """Show that a step of unknown length goes on.
+
+    Where `progress_bar` shows a bar, this shows one too. Elsewhere, such as with stderr in a file,
+    a step of more than 10 s prints a line at most every 10 s: when a stage has begun, and at least
+    once a minute.
 
     Args:
         what: names the step.
+    Yields:
+        A function to call with the name of each stage of the step.
     """
-    if not _is_watched():
-        yield
-        return
-    bar = _BarProgress(what)
-    bar.wait()
+    shown: _BarProgress | _Lines = _BarProgress(what) if _is_watched() else _Lines(what)
+    shown.begin()
     try:
-        yield
+        yield shown.stage
     finally:
-        bar.stop()
+        shown.stop()

@@ -30,7 +30,7 @@ _COMMANDS = {
     "analyse": ("haselab.cli.study.analyse", "Repeat fits, design and report from a recording."),
     "sense": ("haselab.cli.data.sense", "Compute capacitance from both monitors."),
     "init": ("haselab.cli.model.init", "Write an actuator file to start from."),
-    "calibrate": ("haselab.cli.bench.calibrate", "Calibrate the monitors with known capacitors."),
+    "calibrate": ("haselab.cli.bench.calibrate", "Calibrate the monitors of a simulated bench."),
     "plan": ("haselab.cli.bench.plan", "Choose the carrier and check a study's feasibility."),
     "plan-experiment": (
         "haselab.cli.identify.plan_experiment",
@@ -56,7 +56,7 @@ _COMMANDS = {
     "report": ("haselab.cli.study.report", "Write the report of a run or of an actuator file."),
     "twin": ("haselab.cli.bench.twin", "Describe or serve a simulated bench."),
     "panel": ("haselab.cli.bench.panel", "Show and drive a bench in a browser."),
-    "rig": ("haselab.cli.bench.rig", "Check a bench in stages, or make it safe."),
+    "rig": ("haselab.cli.bench.rig", "Check a bench in stages, or take it to 0 V."),
     "firmware": ("haselab.cli.model.firmware", "Build, simulate or flash the microcontroller."),
     "doctor": ("haselab.cli.doctor.command", "Report what is installed and which devices answer."),
 }
@@ -114,7 +114,9 @@ class _Root(LazyGroup):
 def cli() -> None:
     """Measure, model and control soft electrostatic actuators (HASEL, DEA).
 
-    A simulated bench, the twin, is built in, so every command can be tried without hardware.
+    A simulated bench, the twin, is built in, so every command can be tried without hardware. In all
+    help texts, "the paper" and its equations are those of Schunk et al., System Identification and
+    Closed-Loop Control of a HASEL Actuator, IROS 2018.
     """
 
 

@@ -14,9 +14,9 @@ F = TypeVar("F", bound=Callable[..., Any])
 OTHER_SIGN = "a minus before the name (-Laser) changes the sign"
 # option: (metavar, None for click's own; what it does)
 _SHARED: dict[str, tuple[str | None, str]] = {
-    "--actuator": ("A.toml", "Use this actuator file."),
+    "--actuator": ("A.toml", "Use this actuator file, or that in the folder of a run."),
     "--ampere-per-monitor-volt": (None, "Set the scale of the current monitor in A/V."),
-    "--at-rest": (None, "Assume that each record starts at rest."),
+    "--at-rest": (None, "Assume that each record starts in a steady state."),
     "--blank-s": (None, "Ignore this time after each step of the output, in s."),
     "--block-s": (None, "Set the length of a block in s. Each block gives one capacitance."),
     "--board": (None, "Choose the board."),
@@ -38,12 +38,12 @@ _SHARED: dict[str, tuple[str | None, str]] = {
         "Default: the estimates.",
     ),
     "--duration-s": (None, "Set the duration in s."),
-    "--experiment": ("NAME", "Name the experiment in the session."),
+    "--experiment": ("NAME", "State the name of the experiment in the session."),
     "--gain-v-per-v": (None, "State the gain of the amplifier in V/V."),
     "--held-at-hz": (None, "State the update rate of the output converter in Hz."),
     "--hold": (
         None,
-        "Choose how the input behaves between its samples. zero: it is held; first: straight "
+        "Choose how the input behaves between its samples. zero: it is constant; first: straight "
         "lines; band-limited: it was measured behind an anti-aliasing filter.",
     ),
     "--i": ("COLUMN", f"Name the column of the current monitor, in V; {OTHER_SIGN}."),
@@ -82,12 +82,13 @@ _SHARED: dict[str, tuple[str | None, str]] = {
     "--to": (None, "Choose the output format."),
     "--twin": (
         "FILE.toml",
-        "Use the twin of this TWIN.toml, or of the identified actuator of this actuator file.",
+        "Use the twin of this TWIN.toml, or of the identified actuator of this actuator file (or "
+        "folder of a run).",
     ),
     "--v": ("COLUMN", f"Name the column of the voltage monitor, in V; {OTHER_SIGN}."),
     "--volt-per-monitor-volt": (None, "Set the scale of the voltage monitor in V/V."),
     "--workers": (None, "Use this many processes. Default: one for each processor."),
-    "--yes": (None, "Skip the confirmation."),
+    "--yes": (None, "Permit this step without a question."),
     "--zero-length-m": (None, "State the length at zero strain in m."),
 }
 

@@ -91,7 +91,8 @@ def reserved(rule: OutputRule, parameters: Mapping[str, Any], *, force: bool) ->
         InputError: a result exists already, or `force` would move what the command reads.
     """
     outputs = rule.outputs(parameters)
-    _refuse_inputs(rule, parameters, outputs, force)
+    early = [each for each in outputs if each[2] != "last"]  # `last` never comes before 0 V
+    _refuse_inputs(rule, parameters, early, force)
     with contextlib.ExitStack() as opened:
         for option, path, kind in outputs:
             if kind == "folder":

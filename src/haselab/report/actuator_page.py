@@ -15,6 +15,7 @@ from numpy.typing import NDArray
 from haselab.base import Estimate
 from haselab.base.chart import Chart, Curve, Panel
 from haselab.models.actuator import ActuatorTables
+from haselab.models.actuator.sections import PhysicalTable
 from haselab.models.actuator.strain_map import StrainMap
 from haselab.models.maps import VoltageMap
 from haselab.models.plant import Plant
@@ -35,6 +36,7 @@ _TITLES = {
     "drive": "Drive and limits",
     "drive.voltage_map": "Map from strain to drive voltage",
     "model": "Model",
+    "model.physical": "Physical model",
     "controller": "Controller",
 }
 _KEY = {"sensing": "sensing.scale_s"}  # key that a section lacks; the others are whole tables
@@ -56,6 +58,11 @@ _NOT_SHOWN = {"covariance", "alternatives", "reference"}  # matrices, raw readin
 
 Floats = NDArray[np.float64]
 Row = tuple[str, str, str, str]  # name, unit, value, 95 % interval
+_PHYSICAL = "model.physical"
+# Kept as tables of the section: the rows of its parameters have what matters of them.
+_OF_PARAMETERS = {"parameters", "std", "measured", "determined_by", "not_identifiable", "residuals",
+                  "records"}  # fmt: skip
+_SIGNED = ("camera.", "sensing.", "load.", "drift.", "start.")  # whose parameters may be negative
 
 
 @dataclass(frozen=True)
@@ -90,6 +97,7 @@ class _Part:
     doubt: str
     svg: str
     caption: str
+    sources: dict[str, str] = field(default_factory=dict)  # what determines a row, by its name
 
 
 def missing_sections(report: ActuatorReport) -> dict[str, str]:
@@ -128,9 +136,12 @@ def actuator_page(report: ActuatorReport) -> str:
             chart, caption = charts[name]
             with figure_style():
                 svg = inline_svg(to_svg(draw_chart(chart), name.replace(".", "-"), chart.title))
+        if name == _PHYSICAL and _physical(report) is None:
+            continue  # no actuator needs one
         rows = list(_rows_of(report, name))
         missing, doubt = absent.get(_KEY.get(name, name), ""), report.doubts.get(name, "")
-        parts.append(_Part(name, title, rows, missing, doubt, svg, caption))
+        sources = _sources(report) if name == _PHYSICAL else {}
+        parts.append(_Part(name, title, rows, missing, doubt, svg, caption, sources))
     provenance = dict(_provenance(report.sections.get("provenance")))
     simulated = any(origin.get("simulated") is True for origin in provenance.values())
     about = report.tables.actuator
@@ -172,7 +183,9 @@ def _rows_of(report: ActuatorReport, name: str) -> Iterator[Row]:
         table = table.get(part, {}) if isinstance(table, Mapping) else {}
     if not isinstance(table, Mapping):
         return
-    left_out = {"strain_map", "voltage_map"} | _NOT_SHOWN
+    left_out = {"strain_map", "voltage_map", "physical"} | _NOT_SHOWN
+    if name == _PHYSICAL:
+        left_out |= _OF_PARAMETERS
     shown = {key: item for key, item in table.items() if key not in left_out}
     known, units = _intervals(report, name), report.units if name == "controller" else {}
     for key, estimate in known.items():
@@ -180,16 +193,52 @@ def _rows_of(report: ActuatorReport, name: str) -> Iterator[Row]:
     for key, item in _flat(shown):
         if key not in known:
             yield _row(key, item, units)
+    if name == _PHYSICAL:
+        yield from _stated(report)
     for alternative in table.get("alternatives", ()) if name == "controller" else ():
         title = f"alternative {alternative.get('kind', '')}"
         for key, item in _flat({"parameters": alternative.get("parameters", {})}):
             yield _row(f"{title}: {key}", item, units)
 
 
+def _physical(report: ActuatorReport) -> PhysicalTable | None:
+    model = report.tables.model
+    return None if model is None else model.physical
+
+
+def _stated(report: ActuatorReport) -> Iterator[Row]:
+    """Parameters that were not fitted, and how well the model explains its records."""
+    physical = _physical(report)
+    if physical is None:
+        return
+    for key, value in physical.measured.items():
+        yield key, _unit(key), value_text(value), "stated, not fitted"
+    residuals = physical.residuals
+    for what, unit, rms, noise in (
+        ("length", "m", residuals.length_rms_m, residuals.length_noise_m),
+        ("capacitance", "F", residuals.capacitance_rms_f, residuals.capacitance_noise_f),
+    ):
+        if rms is not None and noise is not None:
+            shown = f"{value_text(rms)}, of which noise {value_text(noise)}"
+            yield f"residuals of the {what}, rms", unit, shown, ""
+    if physical.records is not None:
+        yield "experiments of the records", "", value_text(list(physical.records.experiments)), ""
+
+
+def _sources(report: ActuatorReport) -> dict[str, str]:
+    """Which experiments and signals determine each parameter of the physical model."""
+    physical = _physical(report)
+    if physical is None:
+        return {}
+    return {key: ", ".join(found) for key, found in physical.determined_by.items()}
+
+
 def _flat(table: Mapping[str, Any], name: str = "") -> Iterator[tuple[str, Any]]:
     """Values by dotted name; a standard deviation follows its value."""
     for key, item in table.items():
         place = f"{name}.{key}" if name else str(key)
+        if key in _NOT_SHOWN:
+            continue
         if isinstance(item, Mapping):
             yield from _flat(item, place)
         elif isinstance(item, list) and any(isinstance(part, Mapping) for part in item):
@@ -217,12 +266,15 @@ def _row(key: str, item: Any, units: Mapping[str, str] = MappingProxyType({})) -
 
 
 def _unit(key: str) -> str:
-    return next((unit for ending, unit in _UNITS if key.endswith(ending)), "")
+    name = key.partition("[")[0]  # one of several branches
+    return next((unit for ending, unit in _UNITS if name.endswith(ending)), "")
 
 
 def _intervals(report: ActuatorReport, name: str) -> dict[str, Estimate]:
     """Parameters of a section whose covariance is in the file."""
     tables = report.tables
+    if name == _PHYSICAL:
+        return _of_physical(report)
     if name == "model" and report.posterior is not None:
         p = report.posterior
         std = np.sqrt(np.maximum(np.diag(p.covariance), 0.0))
@@ -245,6 +297,22 @@ def _intervals(report: ActuatorReport, name: str) -> dict[str, Estimate]:
         key: Estimate.normal(getattr(table, key), s, _unit(key))
         for key, s in zip(keys, std, strict=True)
     }
+
+
+def _of_physical(report: ActuatorReport) -> dict[str, Estimate]:
+    """Fitted parameters of the physical model; one that is not identifiable has no ends."""
+    physical = _physical(report)
+    found: dict[str, Estimate] = {}
+    for key, value in ({} if physical is None else physical.parameters).items():
+        assert physical is not None
+        std = physical.std.get(key, np.nan)
+        if key in physical.not_identifiable or not np.isfinite(std):
+            found[key] = Estimate(value, np.nan, (np.nan, np.nan), _unit(key))
+        elif value > 0.0 and not key.startswith(_SIGNED):
+            found[key] = Estimate.lognormal(value, std / value, _unit(key))
+        else:
+            found[key] = Estimate.normal(value, std, _unit(key))
+    return found
 
 
 # ---- figures ------------------------------------------------------------------------------------

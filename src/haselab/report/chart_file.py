@@ -84,6 +84,8 @@ def _draw_panel(axes: Axes, panel: Panel) -> None:
         axes.set_xscale("log")
     if panel.log_y:
         axes.set_yscale("log")
+    if panel.y_limits is not None:
+        axes.set_ylim(*panel.y_limits)
     if panel.ticks:
         axes.set_xticks(range(len(panel.ticks)), [label_text(text) for text in panel.ticks])
     if any(curve.label for curve in panel.curves):

@@ -59,20 +59,22 @@ def interval_text(
         ci95: low and high end, same unit; an end without a finite value is open.
 
     Returns:
-        Text of the value and text of the interval.
+        Text of the value and text of the interval, which is a dash if both ends are open.
 
     Example:
         >>> interval_text(5.1134, 0.0213, (5.0717, 5.1551))
         ('5.113', '[5.072, 5.155]')
         >>> interval_text(-2e-5, 0.0021, (-0.0041, 0.0041))
         ('0.0000', '[−0.0041, 0.0041]')
+        >>> interval_text(5.1134, None, (None, None))
+        ('5.1134', '—')
     """
     if value is None or not math.isfinite(value):
         return ABSENT, ABSENT
     ends = [end if end is not None and math.isfinite(end) else None for end in ci95]
     if std is None or not math.isfinite(std) or std <= 0.0:
         low, high = (number_text(end) if end is not None else "open" for end in ends)
-        return number_text(value), f"[{low}, {high}]"
+        return number_text(value), ABSENT if ends == [None, None] else f"[{low}, {high}]"
     exponent = _exponent(max(abs(value), std))
     scale = 10.0**exponent
     decimals = min(max(1 - math.floor(math.log10(std / scale)), 0), 9)
@@ -82,7 +84,7 @@ def interval_text(
     ]
     return (
         _with_power(texts[0], exponent),
-        _with_power(f"[{texts[1]}, {texts[2]}]", exponent),
+        ABSENT if ends == [None, None] else _with_power(f"[{texts[1]}, {texts[2]}]", exponent),
     )
 
 
@@ -112,7 +114,8 @@ def value_text(value: Any) -> str:
             shown, interval = interval_text(value["value"], value.get("std"), value["ci95"])
             if shown == ABSENT:
                 return ABSENT
-            return f"{shown} {interval} {value.get('unit', '')}".rstrip()
+            parts = (shown, "" if interval == ABSENT else interval, str(value.get("unit") or ""))
+            return " ".join(filter(None, parts))
         return "; ".join(f"{name} {value_text(item)}" for name, item in value.items())
     if isinstance(value, (list, tuple)):
         if len(value) > _MOST_ITEMS:

@@ -14,8 +14,9 @@ from haselab.report.charts import chart_plans
 from haselab.report.figures import PLANS, DrawnFigure, FigurePlan, draw_figure
 from haselab.report.folder import RunFolder, read_folder
 from haselab.report.numbers import value_text
-from haselab.report.overview.facts import facts, loop_table
+from haselab.report.overview.facts import facts
 from haselab.report.overview.groups import is_empty, result_groups
+from haselab.report.overview.loops import loop_table, prediction_table
 from haselab.report.overview.summary import summary_text
 from haselab.report.results import Results
 from haselab.store.claim import refuse_linked_folders
@@ -43,8 +44,8 @@ _DEFINITIONS = {
     "way around the final strain.",
     "overshoot": "Overshoot: largest strain beyond the final strain, as a fraction of the way.",
     "peak_excess": "Peak beyond desired strain: largest strain beyond the desired strain, as a "
-    "fraction of the desired step. Compare modes by it: in open loop, creep raises the final "
-    "strain, which hides the ringing from the overshoot.",
+    "fraction of the desired step. Compare modes by it: in open loop, slow motion changes the "
+    "final strain and with it the overshoot; creep hides the ringing.",
     "error": "Final error: desired minus final strain, as a fraction of the desired step.",
 }
 
@@ -113,7 +114,8 @@ def compose_page(run: RunFolder) -> Page:
         unverified=str(run.results.provenance.get("unverified", "")),
         simulated=run.results.simulated,
         facts=facts(run),
-        loops=loop_table(run.results),
+        loops=loop_table(run),
+        predictions=prediction_table(run),
         groups=result_groups(rows, run.analysis),
         empty=[row for row in rows if is_empty(row)],
         has_noise_free=any(row.noise_free is not None for row in rows),

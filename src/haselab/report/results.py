@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 from haselab.base import Estimate, InputError
@@ -60,7 +60,7 @@ class Quantity:
         """The direct fit with its 95 % interval; `""` where there is none."""
         if self.direct is None:
             return ""
-        return " ".join(interval_text(self.direct.value, self.direct.std, self.direct.ci95))
+        return value_text(replace(self.direct, unit="").to_dict())
 
     @property
     def measured_text(self) -> str:

@@ -133,8 +133,8 @@ class Gate:
             ) from None
         except OSError as error:
             raise DeviceError(
-                f"The interlock of {key} cannot be used ({error}). Make its folder writable and "
-                f"free disk space there: {interlock_folder()}"
+                f"The software interlock of {key} cannot be used ({error}). Make its folder "
+                f"writable and free disk space there: {interlock_folder()}"
             ) from None
 
     def release(self) -> None:
@@ -289,7 +289,7 @@ class Gate:
         def checked(acquired: bool) -> Any:
             if not acquired:
                 raise SafetyError(
-                    f"{name} was refused: another program is making the bench safe and has not "
+                    f"{name} was refused: another program is taking the bench to 0 V and has not "
                     f"finished after {_CALL_S:g} s. The output was not changed. Check that program."
                 )
             if not self.permitted:
@@ -314,7 +314,7 @@ class Gate:
         ):
             raise SafetyError(
                 f"{name} of the driver returned a generator or a coroutine, which could act after "
-                "the bench was made safe. Make it act before it returns."
+                "the bench was taken to 0 V. Make it act before it returns."
             )
         return answer
 
@@ -341,8 +341,8 @@ class Gate:
             return SafetyError(self.expired)
         why = self.revoked or self.interlock.reason
         if why:
-            return SafetyError(f"The bench was made safe: {why}. Arm it again before applying a "
-                               "voltage.")  # fmt: skip
+            return SafetyError(f"The permission of the bench was revoked: {why}. Arm it again "
+                               "before applying a voltage.")  # fmt: skip
         return SafetyError("The bench is not armed. Arm it before applying a voltage.")
 
     def settle(self, wait_s: float) -> None:

@@ -282,7 +282,7 @@ def _put_gate(rig: Rig) -> Gate:
         missing = [method for method in needed if not callable(getattr(driver, method, None))]
         if driver is not None and missing:
             raise InputError(
-                f"The {name} has no method {missing[0]!r}, so it cannot be made safe. Give your "
+                f"The {name} has no method {missing[0]!r}, so it cannot be taken to 0 V. Give your "
                 f"driver every method of its protocol in haselab.rig."
             )
     gate = rig.gate

@@ -306,7 +306,7 @@ class Interlock:
     def reason(self) -> str:
         """Why the bench was made safe, and when; empty if there is nothing to acknowledge."""
         if self.key and self._file >= 0 and not self.intact:
-            return "The interlock's file was damaged or removed"
+            return "The file of the software interlock was damaged or removed"
         if self._get(_ACKNOWLEDGED) == self._get(_REVISION):
             return ""
         text = self._text(_REASON) or "reason not recorded"

@@ -233,8 +233,8 @@ class Safety:
         interlock = self.gate.interlock
         if not interlock.intact:
             raise SafetyError(
-                "The interlock's files were removed, or the rig was closed. Open the rig again, or "
-                "run the command again."
+                "The software interlock's files were removed, or the rig was closed. Open the rig "
+                "again, or run the command again."
             )
         self._number += 1
         revision = interlock.revision  # read first: `arm` refuses after any later revocation
@@ -259,8 +259,8 @@ class Safety:
             )
         if request.reason and acknowledged != request.reason:
             raise SafetyError(
-                f"The bench was made safe: {request.reason.rstrip('.')}. Remove the cause, then "
-                "acknowledge this reason when you arm."
+                f"The permission of the bench was revoked: {request.reason.rstrip('.')}. Remove "
+                "the cause, then acknowledge this reason when you arm."
             )
         interlock = self.gate.interlock
         self._open = None
@@ -271,16 +271,14 @@ class Safety:
 
     def _grant(self, request: ArmingRequest, acquired: bool) -> None:
         if not acquired:
-            raise SafetyError(
-                "The bench is being made safe by another program. Request arming again."
-            )
+            raise SafetyError("Another program is taking the bench to 0 V. Request arming again.")
         interlock = self.gate.interlock
         with self._changing:
             if interlock.revision != request.revision or self._stage is not Stage.REQUESTED:
                 self._stage = Stage.TRIPPED
                 self._reason = interlock.reason
                 raise SafetyError(
-                    "The bench was made safe after arming was requested: "
+                    "The permission of the bench was revoked after arming was requested: "
                     f"{interlock.reason.rstrip('.')}. Request arming again."
                 )
             interlock.acknowledge(request.revision)

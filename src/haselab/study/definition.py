@@ -35,6 +35,7 @@ __all__ = [
     "file_model",
     "load_step_study",
     "load_study",
+    "quick_note",
     "recorded_study",
     "step_study_of",
 ]
@@ -320,6 +321,25 @@ def _checked_file(
         except InputError as error:
             raise InputError(f"With the changes of [quick]: {error}") from None
     return study
+
+
+def quick_note(path: Path) -> str:
+    """Say that a study has no shorter form, so that a quick run plays all of it.
+
+    Args:
+        path: of a study that can be read.
+    Returns:
+        What happens and what to add; empty if the study has a table `quick`.
+    """
+    data = read_toml(path, "study")
+    if data.get("quick"):
+        return ""
+    tables = [name for name, table in data.items() if isinstance(table, Mapping)]
+    played = next((name for name in tables if name not in _Head.model_fields), "triangle")
+    return (
+        f"--quick changes nothing, because the study has no table [quick]: all of it is played. "
+        f"Add [quick.{played}] with the keys of [{played}] that a quick run changes. {path}"
+    )
 
 
 def builtin_table(name: str, kind: type[Table]) -> Table:

@@ -27,7 +27,7 @@ from haselab.study.paper.row_table import CITATION, study_rows
 from haselab.study.paper.scope import changes_text, not_played
 from haselab.study.pipeline import Findings
 from haselab.study.results import VERDICT_RULE, axis_interpretation, quantity_rows
-from haselab.study.simulated.truth import is_simulated
+from haselab.study.simulated.truth import is_simulated, used_configuration
 from haselab.study.tables import Control
 
 __all__ = [
@@ -50,6 +50,7 @@ _OF_AN_OLDER_MODEL = (
     "fitted_to", "training_output", "input_range", "input_unit", "output_unit",
 )  # fmt: skip
 _OF_AN_OLDER_DESIGN = ("name", "predicted", "plausible", "uncertainty")
+_RELATIVE = "relative_capacitance"  # in the paper's unit; other studies show it in F
 _START = """\
 # Findings of a study about its actuator, in SI units. Use it with haselab design, compare, firmware
 # and run. Your own comments and keys are kept.
@@ -77,11 +78,18 @@ def results_of(
 ) -> JsonObject:
     """Content of results.json: one row per id, provenance, and whether it could be verified."""
     trials = found.find(Comparison)
+    kind = header["rig"].get("actuator_kind", PLANAR_HASEL)
     results: JsonObject = {
         "quantities": quantity_rows(
-            found.quantities, found.notes, header["rig_config"], noise_free, study, found.direct
+            found.quantities,
+            found.notes,
+            header["rig_config"],
+            noise_free,
+            study,
+            found.direct,
+            kind,
         ),
-        "not_played": not_played(found.quantities, found.figures, study, found.missing),
+        "not_played": not_played(found.quantities, found.figures, study, found.missing, kind),
         "simulated": is_simulated(header["rig_config"]),
         "verdict_rule": VERDICT_RULE,
         "sensing_error": None if trials is None else trials.sensing_error,
@@ -89,7 +97,8 @@ def results_of(
             key: header[key]
             for key in ("recorded", "versions", "seed", "study_sha256", "study", "rig_config")
             if key in header
-        },
+        }
+        | {"rig_config": used_configuration(header["rig_config"])},
     }
     return marked_unverified(results, doubt)
 
@@ -203,8 +212,9 @@ def _without_paper(found: Findings, study: Study) -> dict[str, Any]:
         for name in one.report_figures
     ]
     changed: dict[str, Any] = {"only": [name for name in figures if name != "chain"]}
-    if drawn := found.figures.get("voltage_map"):
-        changed["voltage_map"] = {**drawn, "paper_voltage_v": None}
+    for name, key in (("voltage_map", "paper_voltage_v"), ("capacitance_map", _RELATIVE)):
+        if drawn := found.figures.get(name):
+            changed[name] = {**drawn, key: None}
     return changed
 
 

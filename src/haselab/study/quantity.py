@@ -25,6 +25,7 @@ class Quantity:
         note: remark for any study.
         plain_name: name for readers without the publication; "": use `name`.
         reference_only: the row is about the publication and not part of other studies.
+        planar_only: the row is no result of other kinds of actuator than the planar HASEL.
     """
 
     name: str
@@ -38,6 +39,7 @@ class Quantity:
     note: str = ""
     plain_name: str = ""
     reference_only: bool = False
+    planar_only: bool = False
 
     def without_paper(self) -> Quantity:
         """The same row in a study that is not compared with a publication."""

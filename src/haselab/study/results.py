@@ -8,6 +8,7 @@ from dataclasses import replace
 from typing import Any
 
 from haselab.base import Estimate, Json, JsonObject
+from haselab.rig.protocols import PLANAR_HASEL
 from haselab.study.analysis import experiments_of
 from haselab.study.definition import Study
 from haselab.study.experiments.foreign import rows_of_experiment
@@ -87,6 +88,7 @@ def quantity_rows(
     noise_free: Mapping[str, float] | None = None,
     study: Study | None = None,
     direct: Mapping[str, Estimate] | None = None,
+    kind: str = PLANAR_HASEL,
 ) -> list[JsonObject]:
     """Rows of results.json.
 
@@ -98,6 +100,7 @@ def quantity_rows(
         study: that was played, whose experiments name the rows; None: the reference study.
         direct: results of the experiments' own fits, by id, where `measured` has those of the
             identified physical model.
+        kind: of the actuator, see `rows_of`.
     Returns:
         One row per id, in the table's order.
     """
@@ -106,7 +109,7 @@ def quantity_rows(
     compared = study is None or study.is_reference
     true = {} if twin is None else parameters(twin)
     rows = []
-    for key, named in (quantities() if study is None else rows_of(study)).items():
+    for key, named in (quantities() if study is None else rows_of(study, kind)).items():
         if key not in measured:
             continue
         quantity = named if compared else named.without_paper()
@@ -145,11 +148,12 @@ def quantity_rows(
     return rows
 
 
-def rows_of(study: Study) -> dict[str, Quantity]:
+def rows_of(study: Study, kind: str = PLANAR_HASEL) -> dict[str, Quantity]:
     """All results that a study may have, by id, in the order of the report.
 
     Args:
         study: the reference study also has the rows that `reproduce` plays beside it.
+        kind: of the actuator; results in units of the paper are those of a planar HASEL alone.
     """
     found: dict[str, Quantity] = {}
     for experiment in experiments_of(study):
@@ -157,7 +161,12 @@ def rows_of(study: Study) -> dict[str, Quantity]:
     if study.is_reference:
         found = paper_rows(*_APART) | found
         return {key: found[key] for key in (*quantities(), *found) if key in found}
-    return {key: row for key, row in found.items() if not row.reference_only}
+    planar = kind == PLANAR_HASEL
+    return {
+        key: row
+        for key, row in found.items()
+        if not row.reference_only and (planar or not row.planar_only)
+    }
 
 
 def _fixed_by(study: Study) -> dict[str, str]:

@@ -96,7 +96,8 @@ class StaticLoad(Section):
 
     masses_kg: tuple[float, ...] = Field(
         max_length=1000,
-        description=f"masses in the order of hanging, at least {LEAST_LOADS} different ones",
+        description="masses in the order in which they are hung, at least "
+        f"{LEAST_LOADS} different ones",
         examples=[[0.0, 0.1, 0.2, 0.3, 0.4, 0.5, 0.6]],
     )
     settle_s: float = Field(
@@ -169,8 +170,8 @@ class Steps(Section):
     open_trials: int = Field(
         ge=0,
         le=1000,
-        description="trials in open loop; 0 only without [chirp], for a step that only the "
-        "controller of custom_trials reaches",
+        description="trials in open loop; at least 1 if the study has [chirp]; 0 is for a step "
+        "that only the controller of custom_trials reaches",
         examples=[2],
     )
     pi_trials: int = Field(ge=0, le=1000, description="trials with the PI", examples=[2])

@@ -223,6 +223,15 @@ def test_a_wrong_serial_number_stops_the_check_and_is_found_by_the_doctor(
     assert "Connect that one, or change generator.serial_number" in found["generator"]["advice"]
 
 
+def test_an_existing_out_does_not_keep_rig_safe_from_commanding_0_v(rig: Path, capsys) -> None:
+    before = rig.read_bytes()
+    for force in ([], ["--force"]):
+        code, out, err = call(capsys, "rig", "safe", rig, "--out", rig, *force)
+        assert code == 2 and "0 V set" in out and str(rig) in err
+        assert out.count("off, as reported by the instrument") == 2
+        assert rig.read_bytes() == before and not list(rig.parent.glob("*previous*"))
+
+
 def test_a_bench_is_made_safe_by_a_command(rig: Path, capsys) -> None:
     code, out, err = call(capsys, "rig", "safe", rig)
     assert code == 0 and "0 V set" in out and out.count("off, as reported by the instrument") == 2

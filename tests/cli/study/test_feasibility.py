@@ -126,7 +126,7 @@ def test_a_bench_that_was_made_safe_is_armed_only_after_its_reason_was_acknowled
     monkeypatch.setattr(click, "confirm", lambda words, err: bool(asked.append(words)))
     for operator in (None, Operator(), Operator(yes=True)):
         with (
-            pytest.raises(SafetyError, match=r"The bench was made safe(: |\. Reason: )Smoke \(on "),
+            pytest.raises(SafetyError, match=r"was revoked(: |\. Reason: )Smoke \(on "),
             armed_rig(plain, file, path, study, tmp_path, operator),
         ):
             raise AssertionError("must not be entered")
@@ -234,6 +234,27 @@ def test_the_quick_tables_are_checked_without_quick(
     with pytest.raises(SystemExit) as stop:
         main(["plan", "feasibility", str(study), "--rig", str(rig)])
     assert stop.value.code == 0
+
+
+@pytest.mark.parametrize(
+    ("more", "is_said"),
+    [("", True), ("[quick]\n", True), ("[quick.triangle]\ncycles = 4\n", False)],
+)
+def test_a_quick_run_of_a_study_without_a_quick_form_says_that_all_of_it_is_played(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str], more: str, is_said: bool
+) -> None:
+    """Here the bench refuses the study afterwards, so that the test is short."""
+    study, rig = tmp_path / "study.toml", tmp_path / "rig.toml"
+    rig.write_text('kind = "twin"\n')
+    study.write_text(TRIANGLE.replace("high_v = 2.0", "high_v = 9.0") + more)
+    words = ["run", str(study), "--rig", str(rig), "--quick", "--out", str(tmp_path / "out")]
+    with pytest.raises(SystemExit) as stop:
+        main(words)
+    lines = capsys.readouterr().err.splitlines()
+    assert stop.value.code == 2 and len(lines) == 1 + is_said
+    said = "haselab: --quick changes nothing, because the study has no table [quick]"
+    assert lines[0].startswith(said) == is_said
+    assert not is_said or "Add [quick.triangle] with the keys of [triangle]" in lines[0]
 
 
 @pytest.mark.parametrize("high_v", [0.5, 2.0, 10.0])

@@ -266,6 +266,7 @@ def test_the_figure_has_the_response_the_fit_and_their_bands():
     assert np.allclose(coherence.curves[0].y, response.coherence[positive])
     axes = response.plot().axes
     assert [each.get_ylabel() for each in axes] == ["Magnitude", "Phase (°)", "Coherence"]
+    assert axes[2].get_ylim() == (0.0, 1.05)  # all of its range, also where it is near 1
 
 
 def test_a_line_far_above_the_band_is_a_band_of_its_own_and_no_curve_leads_to_it():

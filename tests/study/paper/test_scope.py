@@ -10,6 +10,7 @@ from haselab.rig.twin.config import Origin, twin_of_reading
 from haselab.study.definition import builtin_study
 from haselab.study.paper.quantity_table import quantities
 from haselab.study.paper.scope import changes_text, not_played
+from haselab.study.results import rows_of
 
 REFERENCE = builtin_study()
 STUDY = REFERENCE.model_dump(mode="json")
@@ -112,3 +113,24 @@ def test_the_identified_actuator_of_a_twin_is_named() -> None:
 def test_another_rig_than_the_twin_is_said() -> None:
     printed = changes_text({"study": STUDY, "rig_config": {"kind": "bench"}})
     assert printed == "This run used another rig than the twin, which rows S1 and S4 describe."
+
+
+def test_another_study_does_not_list_additional_trials_that_it_does_not_request() -> None:
+    """They are the paper's, or tests of one loop: nobody misses them."""
+    study = REFERENCE.model_copy(update={"name": "mine"})
+    off = {"paper_chain_trials": 0, "extra_delay_trials": 0, "saturating_trials": 0, "pi_trials": 0}
+    steps = REFERENCE.steps.model_copy(update=off)
+    mine = study.model_copy(update={"steps": steps})
+    found = {key: part["reason"] for part in not_played((), {}, mine) for key in part["ids"]}
+    assert not [key for key in found if key.startswith("S10.")]
+    assert not {"S24.rise_delayed", "S22.recovery_time"} & set(found)
+    assert found["S24.rise_closed"] == "steps.pi_trials is 0 in this study."
+    asked = {key for part in not_played((), {}, study) for key in part["ids"]}
+    assert {"S10.rise_printed_chain", "S24.rise_delayed", "S22.recovery_time"} <= asked
+
+
+def test_results_in_the_papers_unit_are_those_of_a_planar_hasel() -> None:
+    study = REFERENCE.model_copy(update={"name": "mine"})
+    planar, peano = rows_of(study), rows_of(study, "peano-hasel")
+    assert set(planar) - set(peano) == {key for key in planar if key.startswith("S15.")}
+    assert rows_of(REFERENCE) == rows_of(REFERENCE, "peano-hasel")  # its table is the paper's

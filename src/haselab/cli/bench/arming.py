@@ -31,7 +31,9 @@ F = TypeVar("F", bound=Callable[..., Any])
 
 def arming_options(function: F) -> F:
     """Add `--yes` and `--acknowledge`, see `Operator`."""
-    yes = shared_option("--yes", is_flag=True, detail="High voltage WILL be applied; keep clear.")
+    yes = shared_option(
+        "--yes", is_flag=True, detail="High voltage WILL be applied at once; keep clear."
+    )
     return yes(acknowledge_option(function))
 
 
@@ -68,7 +70,7 @@ class Operator:
         if self.acknowledge:
             click.echo(f"Acknowledged: {reason}", err=True)
             return reason
-        stated = f"The bench was made safe. Reason: {reason.rstrip('.')}."
+        stated = f"The permission of the bench was revoked. Reason: {reason.rstrip('.')}."
         if not self.yes and _confirmed(f"{stated} Has the cause been removed?"):
             return reason
         raise SafetyError(

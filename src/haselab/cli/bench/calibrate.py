@@ -230,7 +230,9 @@ def _check_sane(answer: dict[str, Any]) -> None:
 
 
 @click.command("calibrate")
-@shared_option("--rig", required=True, detail="'twin' uses the simulated bench.")
+@shared_option(
+    "--rig", required=True, detail="'twin' uses the default twin. A real bench is refused."
+)
 @shared_option(
     "--capacitor",
     "references",
@@ -259,12 +261,13 @@ def command(
     plot: Path | None,
     **options: Any,
 ) -> None:
-    """Calibrate the monitors with reference capacitors.
+    """Calibrate the monitors of a simulated bench with reference capacitors.
 
-    VOLTAGE WILL BE APPLIED: the carrier, 100 V peak at the default --carrier-v and a gain of 5000.
-    Each --capacitor takes the actuator's place in turn. Connect it only when the command asks you
-    to, with the amplifier off and the electrodes shorted. During a measurement the drive is 0 V and
-    the carrier is on. On the twin the capacitors are exchanged automatically. --actuator or --out
+    NO VOLTAGE IS APPLIED: --rig must be 'twin' or a rig file of kind = "twin". Therefore the
+    command asks no question, arms nothing, and does not change the state of a bench that has
+    tripped. A real bench is refused (exit code 2); the page 'Sensing' of the documentation
+    describes its calibration in Python. Each --capacitor takes the actuator's place in turn,
+    automatically. During a measurement the drive is 0 V and the carrier is on. --actuator or --out
     names the file for the calibration, which `haselab sense` reads.
     """
     if out is not None and out.is_dir():

@@ -16,6 +16,7 @@ import click
 from haselab.base import DeviceError, InputError, shown
 from haselab.cli.common import Real
 from haselab.cli.options import shared_option
+from haselab.cli.run_path import ACTUATOR_FILE
 from haselab.panel.files import PanelFiles
 from haselab.panel.page_server import serve
 from haselab.panel.processes import Panel, running_panel, stop_answers
@@ -53,7 +54,7 @@ def _check_lan(context: click.Context, option: click.Parameter, value: str) -> s
     "--rig", type=click.Path(path_type=Path), detail="Default: the twin of the reference study."
 )
 @shared_option(
-    "--actuator", type=click.Path(path_type=Path),
+    "--actuator", type=ACTUATOR_FILE,
     detail="With both maps and a controller, the panel can close the loop. With a model, its page "
     "Design changes the gains. Default: none.",
 )  # fmt: skip

@@ -1,4 +1,4 @@
-"""`haselab rig`: check a bench in stages, make it safe, and show its state."""
+"""`haselab rig`: check a bench in stages, take it to 0 V, and show its state."""
 
 from __future__ import annotations
 
@@ -67,7 +67,7 @@ _DONE = {
 
 @click.group("rig")
 def command() -> None:
-    """Check a bench in stages, or make it safe."""
+    """Check a bench in stages, or take it to 0 V."""
 
 
 def _mock(file: RigFile, path: Path) -> Iterator[CheckResult]:
@@ -258,7 +258,7 @@ def _first_block(rig: Rig) -> bytes:
 )
 @shared_option(
     "--yes", is_flag=True,
-    detail="High voltage WILL be applied; keep clear. Required with --live.",
+    detail="High voltage WILL be applied at once; keep clear. Required with --live.",
 )  # fmt: skip
 @shared_option(
     "--capacitor", type=Real(1e-12, 1e-6), metavar="FARAD",
@@ -276,14 +276,14 @@ def _first_block(rig: Rig) -> bytes:
     "--frames",
     type=Real(0.01, 1e5),
     metavar="HZ",
-    help="Record frames for 10 s at this rate, in Hz. Default: 0.5 s at up to 100 Hz.",
+    help="Record frames for 10 s at this frame rate, in Hz. Default: 0.5 s at up to 100 Hz.",
 )
 @click.option(
     "--save",
     type=click.Path(path_type=Path),
     metavar="CHECK.json",
-    help="Write a report to send to others: rig file, computer, instruments, all checks. "
-    "Default: none.",
+    help="Write a report to attach to an issue: rig file, computer, instruments, all checks. "
+    "--out has the checks only. Default: none.",
 )
 @acknowledge_option
 @answer_options(OutputRule(options=("save",)))
@@ -301,8 +301,10 @@ def check(
 ) -> None:
     """Check the bench of RIG in stages.
 
-    The stages are mock (no instrument), dry (no high voltage) and, with --live, live (high
-    voltage). The command stops at the first check that fails and commands all outputs to 0 V.
+    The stages are mock (no instrument), dry (no high voltage) and, with --live, live. With --live
+    and --yes, HIGH VOLTAGE WILL BE APPLIED AT ONCE, without a question. After a trip, the bench is
+    armed only with --acknowledge. The command stops at the first check that fails and commands all
+    outputs to 0 V.
     """
     if live and not yes:
         raise click.UsageError(
@@ -403,11 +405,17 @@ def _answer(
     "--bench", metavar="KEY",
     help="Name a bench of your own drivers by its key in Gate.claim. Default: the bench of RIG.",
 )  # fmt: skip
-@answer_options(OutputRule("last"))
+@answer_options(
+    OutputRule("last"),
+    "It is a JSON file, written after 0 V was commanded: a path that exists does not stop the "
+    "command. Default: none.",
+    force_detail="Not in this command: an existing --out is kept, and the exit code is 2.",
+)
 def safe(rig: Path | None, bench: str | None, as_json: bool, out: Path | None) -> None:
     """Command 0 V on every output of the bench of RIG.
 
-    IN AN EMERGENCY, PRESS THE EMERGENCY STOP FIRST. The command revokes the permission of whichever
+    IN AN EMERGENCY, PRESS THE EMERGENCY STOP FIRST. Give either RIG or --bench; without them,
+    NOTHING IS COMMANDED TO 0 V (exit code 2). The command revokes the permission of whichever
     program on this computer uses the bench. That program stays at 0 V until you arm the bench again
     and acknowledge the reason. Other benches are not affected, except those that use the same
     generator or supply. With --bench, this command cannot reach the outputs: it revokes the

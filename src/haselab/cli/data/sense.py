@@ -390,7 +390,10 @@ class _Out:
 @_option("--current-limit-a", "A block whose current reaches it is not valid. Default: no limit.")
 @shared_option("--v", "v_column", default="v_monitor_v", show_default=True)
 @shared_option("--i", "i_column", default="i_monitor_v", show_default=True)
-@shared_option("--experiment", detail="Needed if the session has several. Default: its only one.")
+@shared_option(
+    "--experiment",
+    detail="It selects what is read; needed if the session has several. Default: its only one.",
+)
 @column_options
 @_scale("--reactance-scale", 2.5e6, "Set the scale in eq. 2 of the paper (relative_capacitance).")
 @_scale("--capacitance-scale", 10.0, "Set the scale in eq. 3 of the paper (relative_capacitance).")

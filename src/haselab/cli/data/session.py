@@ -50,7 +50,7 @@ def command() -> None:
 )  # fmt: skip
 @shared_option(
     "--experiment", "experiments", multiple=True,
-    detail="Repeat the option for more. Default: all.",
+    detail="It selects what is exported. Repeat the option for more. Default: all.",
 )  # fmt: skip
 @click.option(
     "--derived/--recorded-only", default=True, show_default=True,
@@ -140,7 +140,10 @@ def _export(
     detail="It converts lengths to strains and strains to lengths. Required with --displacement. "
     "Default: none.",
 )  # fmt: skip
-@shared_option("--experiment", default="imported", show_default=True)
+@shared_option(
+    "--experiment", default="imported", show_default=True,
+    detail="The imported experiment gets this name.",
+)  # fmt: skip
 @shared_option("--rate-hz", type=Real(1e-3, 1e8), detail="Default: the rate in the file.")
 @click.option(
     "--volt-per-code", type=Real(1e-12, 1e6),

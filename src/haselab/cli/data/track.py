@@ -352,7 +352,7 @@ def _request(options: dict[str, Any]) -> _Request:
 )  # fmt: skip
 @click.option(
     "--fixed", metavar="NAMES|P.csv",
-    help="Subtract the rigid motion of these points, which only move if the camera or its stand "
+    help="Subtract the rigid motion of these points, which only move if the camera or its tripod "
     "moves. Default: none.",
 )  # fmt: skip
 @shared_option("--rate-hz", type=POSITIVE, detail="Default: the frame rate in the file.")
@@ -361,7 +361,10 @@ def _request(options: dict[str, Any]) -> _Request:
     help="Read the times of the frames from a CSV file (frame, time_s), or from a session.h5 with "
     "--experiment. Default: from the frame rate.",
 )  # fmt: skip
-@shared_option("--experiment", detail="Needed if the session has several. Default: its only one.")
+@shared_option(
+    "--experiment",
+    detail="It selects what is read; needed if the session has several. Default: its only one.",
+)
 @click.option(
     "--subset-px", type=INTEGER,
     help="Set the side of a subset in px, odd. Default: 15 with --points, from the size of the "

@@ -70,8 +70,8 @@ _TABLE_CLOCK = 1e-3  # relative standard deviation of their times: 30 frames/s a
               help="Set the starting value of the added inertia in kg: of what moves but does not "
               "load the actuator, such as a lever. Default: 5 % of the hung mass.")  # fmt: skip
 @click.option("--zero-std-m", type=POSITIVE,
-              help="Set the standard deviation of the zero of the lengths in m. Default: 5e-5 with "
-              "tables, 2e-6 without.")  # fmt: skip
+              help="Set the uncertainty (one standard deviation) of the zero of the lengths, in m. "
+              "Default: 5e-5 with tables, 2e-6 without.")  # fmt: skip
 @unverified_option
 @column_options
 @answer_options(plot=True)
@@ -135,11 +135,11 @@ def actuator(
     _warn_of_stated(files, records, gains_v_per_v, tables, actuator)
     tracked = all(file.is_dir() or is_session(file) for file in files)
     _note_assumed(law, tables.actuator, actuator)
-    with waiting("search for the physical model"):
+    with waiting("search for the physical model") as on_stage:
         fit = fit_actuator(
             law, records, mass_kg=mass_kg, added_inertia_kg=added_inertia_kg,
             camera_bias_m=zero_std_m or (TRACKED_ZERO_M if tracked else _TABLE_ZERO_M),
-            clock_std=0.0 if tracked else _TABLE_CLOCK,
+            clock_std=0.0 if tracked else _TABLE_CLOCK, on_stage=on_stage,
         )  # fmt: skip
     if fit.status != "ok" and "kind" not in tables.actuator.model_fields_set:
         doubt = f"[actuator] states no kind, so {fit.kind} was assumed. State kind if it is another"
@@ -159,7 +159,10 @@ def _shorter(fit: ActuatorFit) -> JsonObject:
     """One line for each parameter, linear model and law, in place of tables."""
     return {
         "determined_by": {
-            name: ", ".join(f"{source.text} x{source.variance_growth:.3g}" for source in sources)
+            name: ", ".join(
+                f"{source.text} (without it, {source.variance_growth:.3g} times the variance)"
+                for source in sources
+            )
             for name, sources in fit.determined_by.items()
         },
         "linear_models": {

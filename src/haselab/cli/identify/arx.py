@@ -37,14 +37,17 @@ __all__ = ["arx", "subspace"]
 @RATE
 @click.option(
     "--na", type=INTEGER,
-    help="Set the number of past outputs. Default: chosen by --criterion, with --nb and --nk.",
+    help="Set the number of past outputs, 0 to 12. Default: chosen by --criterion, with --nb and "
+    "--nk.",
 )  # fmt: skip
 @click.option(
-    "--nb", type=INTEGER, help="Set the number of past inputs. Default: chosen by --criterion."
-)
+    "--nb", type=INTEGER,
+    help="Set the number of past inputs, 1 to 64. Default: chosen by --criterion.",
+)  # fmt: skip
 @click.option(
     "--nk", type=INTEGER,
-    help="Set the delay from input to output in samples. Default: chosen by --criterion.",
+    help="Set the delay from input to output in samples, 0 to 1000. Default: chosen by "
+    "--criterion.",
 )  # fmt: skip
 @click.option(
     "--criterion", type=click.Choice(["bic", "aic"]), default="bic", show_default=True,
@@ -52,9 +55,9 @@ __all__ = ["arx", "subspace"]
 )  # fmt: skip
 @click.option(
     "--skip-rows", type=INTEGER, default=0, show_default=True,
-    help="Leave out this many rows at the start.",
+    help="Leave out this many rows at the start, 0 or more.",
 )  # fmt: skip
-@click.option("--rows", type=INTEGER, help="Use this many rows. Default: all.")
+@click.option("--rows", type=INTEGER, help="Use this many rows, 1 or more. Default: all.")
 @shared_option("--keep-means", is_flag=True)
 @column_options
 @answer_options(plot=True)
@@ -110,11 +113,13 @@ def arx(
 @RATE
 @click.option(
     "--order", type=INTEGER,
-    help="Set the number of states. Default: up to the largest gap of the singular values.",
+    help="Set the number of states, 1 to 10 and less than --block-rows. Default: up to the largest "
+    "gap of the singular values.",
 )  # fmt: skip
 @click.option(
     "--block-rows", type=INTEGER, default=15, show_default=True,
-    help="Set the number of past samples, and of future samples, in the data matrices.",
+    help="Set the number of past samples, and of future samples, in the data matrices: at least 2, "
+    "at most an eighth of the number of rows.",
 )  # fmt: skip
 @shared_option("--bootstrap", type=click.IntRange(2, 1000), default=50, show_default=True)
 @shared_option(

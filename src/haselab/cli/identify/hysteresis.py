@@ -44,7 +44,9 @@ __all__ = ["creep", "hysteresis"]
     show_default=True, detail="auto: the one that fits the data best.",
 )  # fmt: skip
 @click.option(
-    "--operators", type=INTEGER, help="Set the number of play operators. Default: chosen by BIC."
+    "--operators",
+    type=INTEGER,
+    help="Set the number of play operators, 1 to 20. Default: chosen by BIC.",
 )
 @click.option(
     "--from-s", type=REAL, default=0.0, show_default=True,

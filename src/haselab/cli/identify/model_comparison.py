@@ -86,9 +86,9 @@ def model_comparison(
 ) -> None:
     """Compare models; report which the records support.
 
-    The answer may be that the records do not decide. All FILES are fitted together; they hold the
-    columns of the drive, in V with its sign, and of the output. For the question agreement, FILES
-    are JSON answers of other commands.
+    The answer may be that the records do not decide. All FILES are fitted together; they contain
+    the columns of the drive, in V with its sign, and of the output. For the question agreement,
+    FILES are JSON files that other commands wrote with --out.
     """
     if question == _AGREEMENT:
         agreement = _agreement(files, options["key"], options["risk"])

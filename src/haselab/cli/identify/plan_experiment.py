@@ -16,6 +16,7 @@ from haselab.cli.common import LIMIT, REAL, answer_options, emit
 from haselab.cli.identify.plan_for_actuator import plan_for_actuator
 from haselab.cli.options import shared_option
 from haselab.cli.plot import save_plot
+from haselab.cli.run_path import MODEL_FILE
 from haselab.cli.study.run import rig_file
 from haselab.identify.experiment_design.drives import BenchLimits
 from haselab.identify.experiment_design.plan import (
@@ -43,7 +44,7 @@ _OF_SIGNAL = (
 
 
 @click.command("plan-experiment")
-@click.argument("model", type=click.Path(path_type=Path))
+@click.argument("model", type=MODEL_FILE)
 @shared_option(
     "--rig", type=click.Path(path_type=Path),
     detail="Default: none; MODEL is then an actuator file with [model.physical].",
@@ -67,7 +68,7 @@ _OF_SIGNAL = (
 )
 @click.option(
     "--baseline-v", type=REAL, default=1.0, show_default=True,
-    help="Set the drive at the start, in V.",
+    help="Set the baseline drive, at which the actuator has settled at the start, in V; above 0 V.",
 )  # fmt: skip
 @shared_option(
     "--capacitance-f", type=REAL, default=1e-9, show_default=True, detail="Include the cable."
@@ -82,7 +83,7 @@ _OF_SIGNAL = (
 )  # fmt: skip
 @click.option(
     "--samples-per-s", type=REAL, default=2.0, show_default=True,
-    help="Set how many independent samples of the output a second contains.",
+    help="Set the number of statistically independent output samples per second.",
 )  # fmt: skip
 @click.option(
     "--systematic", type=REAL, default=0.05, show_default=True,

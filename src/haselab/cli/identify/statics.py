@@ -203,7 +203,8 @@ class _WithStress:
 @column_option(LOAD)
 @click.option(
     "--segments", type=INTEGER,
-    help="Set the number of straight segments. Default: chosen by BIC, at most 6.",
+    help="Set the number of straight segments: at least 1, at most a third of the number of rows. "
+    "Default: chosen by BIC, at most 6.",
 )  # fmt: skip
 @_LOWEST
 @_HIGHEST
@@ -287,7 +288,10 @@ def _voltage_notes(
     "--strain-file", type=click.Path(path_type=Path),
     help="Read the strain from this file or session, recorded with the same clock. Default: FILE.",
 )  # fmt: skip
-@shared_option("--experiment", detail="Needed if the session has several. Default: its only one.")
+@shared_option(
+    "--experiment",
+    detail="It selects what is read; needed if the session has several. Default: its only one.",
+)
 @column_options
 @actuator_option("The command writes [sensing.strain_map]: the map from F, with its band.")
 @answer_options(plot=True)

@@ -81,7 +81,7 @@ def _fixed(pairs: Sequence[str]) -> dict[str, float]:
 )  # fmt: skip
 @click.option(
     "--zeros", type=INTEGER, default=0, show_default=True,
-    help="Set the number of zeros, at most the number of poles.",
+    help="Set the number of zeros, 0 to the number of poles.",
 )  # fmt: skip
 @click.option(
     "--delay", default="auto", show_default=True, metavar="auto|S",

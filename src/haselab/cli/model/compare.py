@@ -35,6 +35,7 @@ from haselab.cli.model.physical_comparison import (
 from haselab.cli.model.physical_model import has_physical_model
 from haselab.cli.options import shared_option
 from haselab.cli.plot import save_plot
+from haselab.cli.run_path import MODEL_FILE
 from haselab.identify.fit import Prediction
 from haselab.identify.prediction import note_range, predict
 from haselab.identify.record import HOLDS, Record
@@ -63,20 +64,20 @@ _NO_NOISE = (
 
 
 @click.command("compare")
-@click.argument("model", type=click.Path(path_type=Path))
+@click.argument("model", type=MODEL_FILE)
 @FILES
 @shared_option(
     "--input",
     "source",
     default="u",
-    show_default="u; with a physical model u, voltage_v or voltage",
+    detail="Default: u; with a physical model u, voltage_v or voltage.",
 )
 @shared_option(
     "--output",
     "outputs",
     multiple=True,
-    detail="With a physical model, give it twice for a length and a capacitance.",
-    show_default="y; with a physical model the columns of length, strain, capacitance",
+    detail="With a physical model, give it twice for a length and a capacitance. Default: y; with "
+    "a physical model the columns of length, strain and capacitance.",
 )
 @RATE
 @shared_option(
@@ -90,7 +91,8 @@ _NO_NOISE = (
                "as in 'identify transfer'.")  # fmt: skip
 @shared_option("--held-at-hz", type=REAL, detail="Default: the sampling rate of the file.")
 @shared_option("--experiment", "experiments", multiple=True,
-               detail="Repeat the option for more. Default: all.")  # fmt: skip
+               detail="It selects what is compared. Repeat the option for more. "
+               "Default: all.")  # fmt: skip
 @click.option("--free-offset", is_flag=True,
               help="Estimate a constant offset of all measured lengths, for example after the "
               "camera was moved.")  # fmt: skip
@@ -138,23 +140,22 @@ def command(
 ) -> None:
     """Predict records in FILES that were not used for the fit of MODEL.
 
-    MODEL is an actuator file or a model.json. With the physical model of 'identify actuator', FILES
-    are sessions, folders of runs, or tables with a voltage and a length, strain or capacitance. The
-    command simulates the model with the recorded voltage and compares experiment by experiment. The
-    exit code is 3 if the error is larger than the band explains, or if the model was identified
-    from one of the files.
+    MODEL is an actuator file, the folder of a run, or a model.json. With the physical model of
+    'identify actuator', FILES are sessions, folders of runs, or tables with a voltage and a length,
+    strain or capacitance. The command simulates the model with the recorded voltage and compares
+    experiment by experiment. The exit code is 3 if the error is too large for the band, or if the
+    model was identified from one of the files.
 
     With any other model, such as that of 'identify transfer' or 'identify arx', FILES are tables.
     The command reports the fit in percent, the rms error and the share of samples inside the 95 %
     band. For a Hammerstein model it first applies the curve to the input, and reports no band;
     other nonlinear models are refused. It estimates the initial state and the offset of each
-    record, unless --at-rest is given. Samples that were used for the fit are recognised by their
-    values, also in a part of a record, in another format and with fewer digits. Their share is
-    used_for_fit; it is null if the steps of the converter hide whether the record is a copy or a
-    repetition. The exit code is 3 if this share is above 5 %, if the prediction is worse than the
-    mean of the record, if its rms error without white noise is more than twice the standard
-    deviation that the band states (3.5 times if the band is the uncertainty of the parameters
-    alone), or if the record is explained as well without its input.
+    record, unless --at-rest is given. used_for_fit is the share of samples that were used for the
+    fit; it is null if the command cannot tell a copy of the record from a repetition.
+
+    The exit code is 3 if used_for_fit is above 5 %, if the prediction is worse than the mean of the
+    record, if the error is too large for the band, or if the record can be explained as well
+    without its input. The page 'Your actuator' of the documentation has the exact rules.
     """
     linear = at_rest or through_voltage_map or held_at_hz is not None
     linear |= hold is not None

@@ -18,6 +18,7 @@ from haselab.cli.model.doubts import sensed_loop
 from haselab.cli.model.loop_options import loop_options
 from haselab.cli.options import shared_option
 from haselab.cli.plot import save_plot
+from haselab.cli.run_path import MODEL_FILE
 from haselab.control import (
     Design,
     DesignSpec,
@@ -67,10 +68,28 @@ __all__ = ["command"]
 
 _TIMING_TOLERANCE = 0.01
 _FEW = 0.9  # share of plausible plants below which a design without --probability gets a warning
+_GAINS = ("--kp", "--ki", "--kd", "--derivative-filter-s")  # options of haselab margins
 
 
-@click.command("design")
-@click.argument("model", type=click.Path(path_type=Path))
+class _DesignCommand(click.Command):
+    """Leads gains, which are options of `haselab margins`, to that command."""
+
+    def parse_args(self, ctx: click.Context, args: list[str]) -> list[str]:
+        """Parse the arguments; gains are refused with the command that takes them."""
+        try:
+            return super().parse_args(ctx, args)
+        except click.NoSuchOption as error:
+            if error.option_name not in _GAINS:
+                raise
+            raise click.UsageError(
+                f"This command computes the gains, so it has no option '{error.option_name}'. For "
+                "the margins of your own gains, use: haselab margins MODEL --kp KP --ki KI",
+                ctx,
+            ) from None
+
+
+@click.command("design", cls=_DesignCommand)
+@click.argument("model", type=MODEL_FILE)
 @click.option(
     "--spec", type=click.Path(path_type=Path), metavar="SPEC.toml",
     help="Read the demands from this file. Default: those of the actuator file, or built-in ones.",
@@ -83,9 +102,9 @@ _FEW = 0.9  # share of plausible plants below which a design without --probabili
 )  # fmt: skip
 @loop_options
 @click.option(
-    "--limits", type=(REAL, REAL), show_default="those in the actuator file, else -0.05 0.1",
-    metavar="LOW HIGH",
-    help="Limit the controller's output to this range, in the unit of the model's input.",
+    "--limits", type=(REAL, REAL), metavar="LOW HIGH",
+    help="Limit the controller's output to this range, in the unit of the model's input. Default: "
+    "the limits in the actuator file, else -0.05 0.1.",
 )  # fmt: skip
 @shared_option("--seed", type=SEED, default=0, show_default=True)
 @click.option(
@@ -115,11 +134,11 @@ def command(
 ) -> None:
     """Design controller gains for MODEL and report their margins.
 
-    MODEL is a model.json or an actuator file. The command reads [model], [drive] and the demands of
-    an actuator file and writes its [controller], but leaves the file unchanged if --out is given.
-    The margins include the delay of the loop and the feedthrough of the sensed strain. If the model
-    has a covariance, plausible plants are drawn from it, and the share of them that keeps the
-    margins is reported.
+    MODEL is a model.json, an actuator file, or the folder of a run. The command reads [model],
+    [drive] and the demands of an actuator file and writes its [controller], but leaves the file
+    unchanged if --out is given. The margins include the delay of the loop and the feedthrough of
+    the sensed strain. If the model has a covariance, plausible plants are drawn from it, and the
+    share of them that keeps the margins is reported.
     """
     warn_misspelled_in(model)
     if out is None and model.suffix.lower() == ".toml":

@@ -13,6 +13,7 @@ from haselab.base import InputError
 from haselab.cli.actuator_file import warn_misspelled_in
 from haselab.cli.common import answer_options, emit
 from haselab.cli.options import shared_option
+from haselab.cli.run_path import MODEL_FILE
 from haselab.pipelines.design.model_file import MAT_NAME, read_model, read_origin
 from haselab.rig.twin.fmu import FMI_VERSIONS, twin_fmu
 from haselab.rig.twin.twin_file import load_twin
@@ -25,7 +26,7 @@ _OF_FMU = ("inputs", "outputs", "parameters", "constants")
 
 
 @click.command("export")
-@click.argument("model", type=click.Path(path_type=Path))
+@click.argument("model", type=MODEL_FILE)
 @shared_option(
     "--to", "form", type=click.Choice(["json", "mat", "plant", "fmu"]), required=True,
     detail="json: numerator and denominator; mat: the same for MATLAB's "
@@ -59,8 +60,8 @@ def command(
 ) -> None:
     """Convert MODEL for another tool.
 
-    MODEL is a model.json, an actuator file, or a .json or .mat file that this command has written;
-    with --to fmu a TWIN.toml or an actuator file with [model.physical].
+    MODEL is a model.json, an actuator file, the folder of a run, or a .json or .mat file that this
+    command has written; with --to fmu a TWIN.toml or an actuator file with [model.physical].
     """
     if form == "fmu":
         _refuse({"--input-name": input_name, "--output-name": output_name}, form)

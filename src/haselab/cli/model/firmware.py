@@ -15,6 +15,7 @@ from haselab.cli.common import REAL, SEED, Real, answer_options, emit
 from haselab.cli.model.doubts import warn_doubts
 from haselab.cli.options import shared_option
 from haselab.cli.output import OutputRule
+from haselab.cli.run_path import ACTUATOR_FILE
 from haselab.cli.study.twin_option import draw_option, name_origin, twin_of_options
 from haselab.control import PidGains, Saturation
 from haselab.control.reach import default_step
@@ -203,7 +204,7 @@ def _say_narrowed(settings: ChipSettings, designed: tuple[float, float], run: Pa
 @click.argument("run", type=click.Path(path_type=Path))
 @_structure
 @_source
-@shared_option("--twin", type=click.Path(path_type=Path), detail="Default: see --reading.")
+@shared_option("--twin", type=ACTUATOR_FILE, detail="Default: see --reading.")
 @draw_option
 @shared_option(
     "--reading", type=click.Choice(["rad", "hz"]),
@@ -213,9 +214,9 @@ def _say_narrowed(settings: ChipSettings, designed: tuple[float, float], run: Pa
     "--step",
     "step",
     type=(REAL, REAL),
-    show_default="0 and the step of the design, else 0.04, or half of what the limits allow",
     metavar="BEFORE AFTER",
-    help="Set the desired strain before and after the step.",
+    help="Set the desired strain before and after the step. Default: 0, and the step of the "
+    "design; without such a step 0.04, or half of what the limits allow.",
 )
 @click.option(
     "--before-s",
@@ -255,12 +256,12 @@ def simulate(
     microcontroller in co-simulation, and two loops on the desktop at 100 Hz and 1 kHz. The one at
     1 kHz has the delay and the limits of the microcontroller. All three are first calibrated with a
     reference capacitor. If RUN is a folder, its report then shows the three loops. For a PI or PID,
-    the simulated step of the microcontroller is compared with the step that [model] predicts. If
-    the difference at any time is larger than `frequency_spread`, the band of the strain map and
-    the error of the microcontroller's sensing explain, the command names the cause and exits with
-    code 3. It also exits with code 3 if the comparison says nothing, because the loop is unstable
-    for a natural frequency within `frequency_spread`, or because these errors are as large as the
-    step.
+    the simulated step of the microcontroller is compared with the step that [model] predicts. The
+    tolerated difference comes from `frequency_spread`, the band of the strain map, the error of the
+    microcontroller's sensing and the noise. If the difference is larger at any time, the command
+    names the cause and exits with code 3. It also exits with code 3 if no comparison is possible:
+    the loop is unstable for a natural frequency within `frequency_spread`, or the tolerated
+    difference is as large as the step.
     """
     config = _twin(run, options["reading"], options["twin"], options["draw"])
     refuse_linked_folders(run, "firmware", "figures")
@@ -455,7 +456,8 @@ def _check_image(path: Path) -> None:
 @click.option("--port", required=True, metavar="PORT", help="Name the serial port of the board.")
 @click.confirmation_option(
     "--yes", prompt="Is the high-voltage module off and unplugged?",
-    help="Skip the confirmation. Switch off and unplug the high-voltage module first.",
+    help="Permit this step without a question. First switch off and unplug the high-voltage "
+    "module: the command then does not ask whether you did.",
 )  # fmt: skip
 @answer_options()
 def flash(firmware: Path, port: str, as_json: bool, out: Path | None) -> None:

@@ -18,13 +18,13 @@ def loop_options(command: Callable[..., None]) -> Callable[..., None]:
     for option in (
         shared_option(
             "--delay-s", type=REAL,
-            show_default=f"loop_delay_s in the model file, else {_USUAL.measurement_delay_s:g}",
-            detail="Half the sampling period is added for the hold.",
+            detail="Half the sampling period is added for the hold. Default: loop_delay_s in the "
+            f"model file, else {_USUAL.measurement_delay_s:g}.",
         ),
         shared_option(
             "--rate-hz", type=REAL,
-            show_default=f"rate_hz in the model file, else {_USUAL.rate_hz:g}",
-            detail="It is the rate of the control loop.",
+            detail="It is the rate of the control loop. Default: rate_hz in the model file, else "
+            f"{_USUAL.rate_hz:g}.",
         ),
     ):  # fmt: skip
         command = option(command)

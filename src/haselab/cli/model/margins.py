@@ -15,6 +15,7 @@ from haselab.cli.model.doubts import sensed_loop
 from haselab.cli.model.loop_options import loop_options
 from haselab.cli.options import shared_option
 from haselab.cli.plot import save_plot
+from haselab.cli.run_path import MODEL_FILE
 from haselab.control import LinearController, LoopSetting, PidGains
 from haselab.control.charts import loop_chart
 from haselab.control.stability.margins import loop_margins
@@ -27,7 +28,7 @@ __all__ = ["command"]
 
 
 @click.command("margins")
-@click.argument("model", type=click.Path(path_type=Path))
+@click.argument("model", type=MODEL_FILE)
 @click.option(
     "--kp", type=REAL,
     help="Set the proportional gain, in units of the controller's output per unit of its input: "
@@ -70,10 +71,10 @@ def command(
 ) -> None:
     """Compute the stability margins of a controller.
 
-    MODEL is an actuator file or a model.json. The margins include the delay of the loop and the
-    feedthrough of the sensed strain, for the nominal plant only. The controller is the PID of --kp
-    and --ki, or one of the actuator file: PI, PID, or any kind whose controller has the method
-    linear_feedback.
+    MODEL is an actuator file, the folder of a run, or a model.json. The margins include the delay
+    of the loop and the feedthrough of the sensed strain, for the nominal plant only. The controller
+    is the PID of --kp and --ki, or one of the actuator file: PI, PID, or any kind whose controller
+    has the method linear_feedback.
     """
     warn_misspelled_in(model)
     given, held = (kp, ki, kd, derivative_filter_s), None
@@ -90,11 +91,7 @@ def command(
     setting = sensed_loop(setting, model)
     gains: PidGains | LinearController
     if any(value is not None for value in given):
-        if kp is None or ki is None or kind is not None:
-            raise click.UsageError(
-                "Gains and a controller of the file cannot be combined. Give --kp and --ki "
-                "(and --kd and --derivative-filter-s if needed), or none of them."
-            )
+        _refuse_incomplete(kp, ki, kind)
         gains = PidGains(*(value or 0.0 for value in given))
         if gains.kd and derivative_filter_s is None:
             click.echo(
@@ -111,3 +108,19 @@ def command(
     answer = margins_answer(found, setting)
     emit(answer, as_json=as_json, out=out)
     save_plot(plot, lambda: loop_chart(plant, gains, setting, found.crossover_rad_s))
+
+
+def _refuse_incomplete(kp: float | None, ki: float | None, kind: str | None) -> None:
+    """Refuse some gains without the others, or beside a controller of the file."""
+    if kind is not None:
+        raise click.UsageError(
+            f"--controller {kind} is a controller of the file, and the options of gains describe "
+            "another one. Leave out --controller or the gains."
+        )
+    for name, value in (("--kp", kp), ("--ki", ki)):
+        if value is None:
+            raise click.UsageError(
+                f"Missing option '{name}': the margins of given gains need --kp and --ki. Give "
+                f"{name} 0 for a controller without this part, or leave out all gains for the "
+                "controller of the file."
+            )

@@ -65,10 +65,12 @@ def check_ends(session: SessionReader, path: Path) -> None:
 @answer_options(
     OutputRule("folder", own=_own_folder),
     "It is a folder for the results. Default: the folder of SESSION.",
+    force_detail="It applies to --out only. Without --out, the results in the folder of SESSION "
+    "are replaced.",
 )
 @shared_option(
     "--physical-model/--no-physical-model", default=False, show_default=True,
-    detail="Results S14 to S21 then follow from it.",
+    detail="Results S14 to S21 then follow from it. 'reproduce' does this by default.",
 )  # fmt: skip
 @unverified_option
 def command(

@@ -45,8 +45,9 @@ def _own_page(parameters: Mapping[str, Any]) -> Path:
 @click.command("report")
 @click.argument("source", metavar="DIR|A.toml", type=click.Path(path_type=Path))
 @answer_options(
-    OutputRule(own=_own_page), "It is an HTML page. Default: DIR/report.html, or A-report.html."
-)
+    OutputRule(own=_own_page), "It is an HTML page. Default: DIR/report.html, or A-report.html.",
+    force_detail="It applies to another --out only. The default page is always replaced.",
+)  # fmt: skip
 def command(source: Path, as_json: bool, out: Path | None) -> None:
     """Write the report of a run, or the page of an actuator.
 

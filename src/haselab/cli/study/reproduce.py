@@ -8,12 +8,12 @@ from typing import Literal
 import click
 
 from haselab.cli.bench.arming import armed_rig
-from haselab.cli.common import answer_options
+from haselab.cli.common import SEED, answer_options
 from haselab.cli.options import shared_option
 from haselab.cli.output import OutputRule
+from haselab.cli.run_path import ACTUATOR_FILE
 from haselab.cli.study.chip_experiments import ChipExperiments
 from haselab.cli.study.study_run import (
-    MAX_SEED,
     RUN_FOLDER,
     execute,
     keep_video_option,
@@ -28,9 +28,9 @@ __all__ = ["command"]
 
 @click.command("reproduce")
 @shared_option("--reading", type=click.Choice(["rad", "hz"]), detail="Default: hz.")
-@shared_option("--twin", type=click.Path(path_type=Path), detail="Default: see --reading.")
+@shared_option("--twin", type=ACTUATOR_FILE, detail="Default: see --reading.")
 @draw_option
-@shared_option("--seed", type=click.IntRange(0, MAX_SEED), default=1, show_default=True)
+@shared_option("--seed", type=SEED, default=1, show_default=True)
 @shared_option("--quick", is_flag=True, detail="It has fewer trials and frames.")
 @physical_model_option
 @keep_video_option

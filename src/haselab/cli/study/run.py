@@ -13,6 +13,7 @@ from haselab.cli.common import actuator_option, answer_options
 from haselab.cli.model.doubts import warn_doubts
 from haselab.cli.options import shared_option
 from haselab.cli.output import OutputRule
+from haselab.cli.run_path import ACTUATOR_FILE
 from haselab.cli.study.chip_run import play_on_chip
 from haselab.cli.study.study_run import (
     RUN_FOLDER,
@@ -30,7 +31,7 @@ from haselab.rig.twin.config import TwinConfig
 from haselab.store.actuator_file import ACTUATOR
 from haselab.store.folder import write_text
 from haselab.store.text_file import read_text
-from haselab.study.definition import Study, load_step_study, load_study
+from haselab.study.definition import Study, load_step_study, load_study, quick_note
 from haselab.study.feasibility import check_settings
 from haselab.study.known import with_actuator_tables
 
@@ -61,9 +62,13 @@ def rig_file(path: Path) -> tuple[TwinConfig, int]:
     "--rig", type=click.Path(path_type=Path),
     detail="Default: the default instruments, around the twin of --twin.",
 )  # fmt: skip
-@shared_option("--twin", type=click.Path(path_type=Path), detail="Default: that of --rig.")
+@shared_option("--twin", type=ACTUATOR_FILE, detail="Default: that of --rig.")
 @draw_option
-@shared_option("--quick", is_flag=True, detail="The table [quick] of STUDY describes it.")
+@shared_option(
+    "--quick",
+    is_flag=True,
+    detail="The table [quick] of STUDY describes it; without that table, all of STUDY is played.",
+)
 @keep_video_option
 @actuator_option(
     "Its limits and its calibration apply; its maps are used if the study has no "
@@ -107,10 +112,12 @@ def command(
                 f"Leave it out, and build the firmware with: haselab firmware build {actuator}"
             )
         trials = load_step_study(study, quick=quick)
+        _note_quick(study, quick)
         armed_by = operator if file.port is not None else None
         play_on_chip(trials, file, rig, out, keep_video, armed_by, as_json)
         return
     plan = load_study_with_actuator(study, actuator, quick=quick)
+    _note_quick(study, quick)
     if actuator is not None:
         warn_doubts(actuator)
     if isinstance(file, TwinFile):
@@ -151,6 +158,12 @@ def _rig(rig: Path | None, twin: Path | None, draw: int | None) -> tuple[RigFile
             f"out --twin, or name the rig file of a twin. {rig}"
         )
     return on_bench_of(file, twin, draw, rig), rig
+
+
+def _note_quick(study: Path, quick: bool) -> None:
+    """Say that --quick has no effect on a study without a table for it."""
+    if quick and (note := quick_note(study)):
+        click.echo(f"haselab: {note}", err=True)
 
 
 def load_study_with_actuator(path: Path, actuator: Path | None, *, quick: bool) -> Study:

@@ -30,7 +30,6 @@ from haselab.cli.study.recommended_mass import with_mass_limit
 from haselab.controllers import KnownActuator
 from haselab.models.actuator import ActuatorTables
 from haselab.rig import Rig
-from haselab.rig.rig_file import MAX_SEED
 from haselab.rig.twin.config import TwinConfig
 from haselab.rig.twin.twin_bench import make_twin
 from haselab.runtime.camera_recorder import KeepVideo
@@ -50,7 +49,6 @@ from haselab.study.pipeline import Findings
 from haselab.study.run import RunOptions, run_study, session_header
 
 __all__ = [
-    "MAX_SEED",
     "RUN_FOLDER",
     "ParallelExperiments",
     "check_folder",

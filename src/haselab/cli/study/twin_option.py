@@ -8,14 +8,15 @@ from typing import Literal
 import click
 
 from haselab.base import InputError
+from haselab.cli.common import SEED
 from haselab.cli.options import shared_option
-from haselab.rig.rig_file import MAX_SEED, TwinFile
+from haselab.rig.rig_file import TwinFile
 from haselab.rig.twin.config import TwinConfig
 from haselab.rig.twin.twin_file import is_actuator_file
 
 __all__ = ["draw_option", "name_origin", "on_bench_of", "twin_of_options"]
 
-draw_option = shared_option("--draw", type=click.IntRange(0, MAX_SEED))
+draw_option = shared_option("--draw", type=SEED)
 
 
 def twin_of_options(

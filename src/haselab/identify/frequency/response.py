@@ -170,7 +170,8 @@ class FrequencyResponse:
         return Chart("Frequency response" if fitted is None else "Frequency response and fit", (
             Panel(axis, magnitude, sizes, log_x=True, log_y=True),
             Panel(axis, "Phase (°)", phases, log_x=True),
-            Panel(axis, "Coherence", (Curve(hz, drawn(self.coherence)),), log_x=True),
+            Panel(axis, "Coherence", (Curve(hz, drawn(self.coherence)),), log_x=True,
+                  y_limits=(0.0, 1.05)),
         ))  # fmt: skip
 
     def plot(self) -> Figure:

@@ -13,7 +13,7 @@ residuals and a model error (`model_error`) make it larger.
 from __future__ import annotations
 
 import math
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import replace
 
 import numpy as np
@@ -73,6 +73,7 @@ def fit_actuator(
     camera_bias_m: float = TRACKED_ZERO_M,
     camera_scale_std: float = 5e-5,
     clock_std: float = 0.0,
+    on_stage: Callable[[str], None] = lambda what: None,
 ) -> ActuatorFit:
     """Identify a physical model from records.
 
@@ -86,6 +87,7 @@ def fit_actuator(
         camera_scale_std: relative standard deviation of the camera's scale, with the slow
             errors of tracking over the picture.
         clock_std: relative standard deviation of the stated times.
+        on_stage: called with the name of each stage of the search as it begins.
     Returns:
         The model, with the covariance of its parameters.
     Raises:
@@ -99,13 +101,14 @@ def fit_actuator(
 
     def fit_from(inertia_kg: float) -> ActuatorFit:
         start = Unknowns.of(law, added_inertia_kg=inertia_kg, mass_kg=mass_kg)
-        return _fit(law, records, start, known, clock_std)
+        return _fit(law, records, start, known, clock_std, on_stage)
 
     if added_inertia_kg is not None:
         fit = fit_from(added_inertia_kg)
     else:
         fit = fit_from(_USUAL_INERTIA * mass_kg)
         if fit.contradicted:
+            on_stage("search with a larger added inertia")
             others = (fit_from(share * mass_kg) for share in _LARGE_INERTIAS)
             fit = _with_large_inertia(fit, others, mass_kg)
     if not fit.succeeded:
@@ -150,6 +153,7 @@ def _fit(
     start: Unknowns,
     known: Mapping[str, float],
     clock: float,
+    on_stage: Callable[[str], None],
 ) -> ActuatorFit:
     """Identify a model from plausible records.
 
@@ -159,6 +163,7 @@ def _fit(
         start: where the search begins.
         known: standard deviations of what is known of the camera beforehand.
         clock: relative standard deviation of the stated times.
+        on_stage: see `fit_actuator`.
     """
     count = sum(record.length_m.size + record.capacitance_f.size for record in records)
     if count < _LEAST_VALUES * start.values.size:
@@ -170,6 +175,7 @@ def _fit(
     # far from the minimum, errors of tracking that a pixel shares would only hide the misfit
     plain = Misfit([replace(record, pixel_m=0.0) for record in records], known=known)
     # records hardly separate the camera's scale from the actuator's size: it is estimated last
+    on_stage("first search")
     found = search(plain, start.without((CAMERA_SCALE,)))
     if found is None:
         return ActuatorFit(
@@ -181,20 +187,24 @@ def _fit(
     rejected: list[Rival] = []
     # no effect of a few per cent explains what a constant length or capacitance explains better
     if not found.converged and channel_residuals(plain, found).share > 0.0:
+        on_stage("search with further effects, because the first one did not converge")
         found, rejected = search_with_all_effects(plain, start.without((CAMERA_SCALE,)), found)
     if not (found.converged or rejected):
+        on_stage("search for what is wrong, because no search converged")
         found, fault = _judge_early(plain, start.without((CAMERA_SCALE,)), found)
         if fault is not None:
             return replace(fault, kind=law.kind, evaluations=found.evaluations)
     lacking = start
     if rejected:
         start = start.with_law(found.unknowns.present_law(), found.unknowns.drifts)
+    on_stage("search with the noise of the records")
     misfit, found = _weighed(
         Misfit(records, known=known, strict=True), start.at(found.unknowns), found
     )
     anew = _from_start(misfit, start, found)
     if anew is not None and anew is not found:
         misfit, found = _weighed(misfit, start.at(anew.unknowns), anew)
+    on_stage("comparison with other causes and further effects")
     scaled = _scale_instead(misfit, lacking, found, rejected) if rejected else None
     if scaled is None:
         misfit, found, more, scaled = _with_effects(misfit, start, found)
@@ -208,6 +218,7 @@ def _fit(
         return ActuatorFit(status=moved, kind=law.kind, evaluations=found.evaluations)
     # beside a model error, the evidence for another elastic law would mean nothing
     certain = seen.explained and scaled is None
+    on_stage("comparison with other elastic laws")
     others = compare_elastic_laws(misfit, found) if certain else []
     rejected += [rival for rival in others if rival.log_evidence < 0.0]
     preferred = [rival for rival in others if rival.log_evidence > 0.0]

@@ -56,7 +56,7 @@ export function Arming({ state, link, say, study = null, onArmed = () => {} }) {
   return html`<form onSubmit=${arm}>
     <p><strong>${state.simulated ? "SIMULATED bench: no voltage is applied." : "HIGH VOLTAGE WILL BE APPLIED. Keep clear."}</strong></p>
     <p>${request.limits}</p>
-    ${request.reason && html`<p class="error">The bench was made safe. Reason: ${request.reason}</p>
+    ${request.reason && html`<p class="error">The permission of the bench was revoked. Reason: ${request.reason}</p>
       <label><input type="checkbox" checked=${known} onChange=${(e) => setKnown(e.target.checked)} /> The cause has been removed.</label>
       ${!known && html`<p>Arm is possible once this box is ticked.</p>`}`}
     <label>Highest drive of this run, in V at the amplifier's input, at most ${limitOf(state, state.high_v)}

@@ -46,7 +46,7 @@ def bode_axes(host: FigureBase, rows: int = 2) -> tuple[Axes, ...]:
     axes[1].set_ylabel("Phase (°)")
     axes[1].yaxis.set_major_locator(MultipleLocator(90.0))
     if rows == 3:
-        axes[2].set_ylabel("Coherence (1)")
+        axes[2].set_ylabel("Coherence (0 to 1)")
         axes[2].set_ylim(0.0, 1.05)
     axes[-1].set_xlabel("Angular frequency (rad/s)")
     top = axes[0].secondary_xaxis("top", functions=scale_by(1.0 / (2.0 * math.pi)))

@@ -80,7 +80,9 @@ PLAN = FigurePlan(
     "Figure 8",
     "plant",
     "Chirp experiment. A: measured frequency response, with one standard deviation as a band, "
-    "fitted models, and coherence. B: response to the chirp in time, with those of the models.",
+    "fitted models, and coherence (1: the strain follows the input linearly and without noise; "
+    "below about 0.9 the response is uncertain). B: response to the chirp in time, with those "
+    "of the models.",
     (
         Panel("A", "Frequency response", _bode, wide=True, height_in=5.2),
         Panel("B", "Chirp", _sweep, wide=True, height_in=2.8),

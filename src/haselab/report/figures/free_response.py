@@ -68,17 +68,18 @@ PLAN = FigurePlan(
     "fig5",
     "Figure 5",
     "free response",
-    "Free response at the operating voltage: the mass is lifted and dropped. Displacement relative "
-    "to the final value of eq. 6: trials (blue, red) with the standard deviation of the three "
-    "tracked points as bands, their mean (light blue), eq. 6 as printed (dotted) and with an "
-    "exponential creep term (dashed), and the exponential envelopes (hull curves in the paper) of "
-    "the positive (green) and the negative (purple) peaks (triangles). The envelopes are "
-    "least-squares fits to the logarithms of the peaks, if at least two peaks exceed the creep.",
+    "Free response at the operating voltage: the mass is lifted and dropped. Displacement "
+    "relative to the final value of eq. 6: trials (blue, orange-red) with the standard "
+    "deviation of the three tracked points as bands, their mean (light blue), eq. 6 as printed "
+    "(dotted) and with an exponential creep term (dashed), and the exponential envelopes (hull "
+    "curves in the paper) of the positive (green) and the negative (purple) peaks (triangles). "
+    "The envelopes are least-squares fits to the logarithms of the peaks, if at least two peaks "
+    "exceed the creep.",
     (Panel("", "Displacement after the drop", _free_response, wide=True, height_in=4.0),),
     plain_caption="Free response at the operating voltage: the mass is lifted and dropped. "
-    "Measured displacement: trials (blue, red) with the standard deviation of the three tracked "
-    "points as bands, their mean (light blue), the decaying oscillation alone (dotted) and with "
-    "an exponential creep term (dashed), and the exponential envelopes of the positive (green) "
-    "and the negative (purple) peaks (triangles). The envelopes are least-squares fits to the "
-    "logarithms of the peaks, if at least two peaks exceed the creep.",
+    "Measured displacement: trials (blue, orange-red) with the standard deviation of the three "
+    "tracked points as bands, their mean (light blue), the decaying oscillation alone (dotted) "
+    "and with an exponential creep term (dashed), and the exponential envelopes of the positive "
+    "(green) and the negative (purple) peaks (triangles). The envelopes are least-squares fits to "
+    "the logarithms of the peaks, if at least two peaks exceed the creep.",
 )

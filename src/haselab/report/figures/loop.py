@@ -57,8 +57,8 @@ PLAN = FigurePlan(
     "fig7",
     "Figure 7",
     "loops",
-    "Bode plot of the plant alone (red) and of the loop with each controller (blue: the "
-    "reference PI; other colours: further designs), including the delay of the loop. Dots mark the "
-    "crossover; grey lines mark 0 dB and −180°.",
+    "Bode plot of the plant alone (orange-red, without the delay of the loop) and of the loop with "
+    "each controller, including that delay: the scaled PI (blue), the PID (purple). Dots mark the "
+    "crossover of the margin; grey lines mark 0 dB and −180°.",
     (Panel("", "Plant and loop", _loop, wide=True, height_in=5.2),),
 )

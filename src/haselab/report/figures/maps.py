@@ -5,6 +5,7 @@ from __future__ import annotations
 from matplotlib.axes import Axes
 from matplotlib.figure import FigureBase
 
+from haselab.report.analysis import Section
 from haselab.report.figures.plan import FigurePlan, Panel
 from haselab.report.folder import RunFolder
 from haselab.report.style import BLUE, GREEN, GREY, RED, band, legend_below, scale_by, thinned
@@ -75,6 +76,9 @@ def _voltage_map(host: FigureBase, run: RunFolder) -> None:
 
 def _capacitance_map(host: FigureBase, run: RunFolder) -> None:
     section = run.section("capacitance_map")
+    if "relative_capacitance" not in section and "each_capacitance_f" in section:
+        _map_of_loops(host, section)
+        return
     relative = section.array("relative_capacitance")
     fit_relative = section.array("fit_relative_capacitance")
     axes = host.subplots()
@@ -109,6 +113,27 @@ def _capacitance_map(host: FigureBase, run: RunFolder) -> None:
     )
     axes.ticklabel_format(axis="x", style="sci", scilimits=(-2, 3), useMathText=True)
     axes.set_xlabel("Relative capacitance (a.u.)")
+    axes.set_ylabel("Strain (%)")
+    axes.legend(loc="best")
+
+
+def _map_of_loops(host: FigureBase, section: Section) -> None:
+    """Strain against capacitance in nF, with the map that the loops use."""
+    axes = host.subplots()
+    each_f = section.array("each_capacitance_f")
+    axes.plot(
+        1e9 * each_f, 100.0 * section.array("each_strain", like=each_f), ".", color=GREY,
+        markersize=2, alpha=0.4, rasterized=each_f.size > 400, label="single blocks",
+    )  # fmt: skip
+    farad = section.array("map_capacitance_f")
+    percent = 100.0 * section.array("map_strain", like=farad)
+    axes.plot(1e9 * farad, percent, color=RED, linewidth=2.0, label="map of the loops")
+    ends = section.optional("reconstructed_band")
+    if ends is not None and ends.size == 2:
+        low, high = (percent + 100.0 * end for end in ends)
+        axes.fill_between(1e9 * farad, low, high, color=RED, alpha=0.2, linewidth=0.0,
+                          label="its 95 % band")  # fmt: skip
+    axes.set_xlabel("Capacitance (nF)")
     axes.set_ylabel("Strain (%)")
     axes.legend(loc="best")
 
@@ -159,7 +184,6 @@ PLAN = FigurePlan(
     "three points at the lower clamp), capacitance. The first cycles are excluded from the fits. "
     "B: voltage against strain, with its hysteresis loop, and the fit of two exponentials; zero "
     "strain is the chosen baseline. C: strain against capacitance: every block of the fitted "
-    "cycles (grey), means of the rising and the falling edge at equal times from the peak (blue), "
-    "and the straight line through these means. D: strain measured by the camera, and strain "
-    "computed from capacitance with the map that the control loops use.",
+    "cycles (grey), and the map that the control loops use (orange-red). D: strain measured by the "
+    "camera, and strain computed from capacitance with the map that the control loops use.",
 )

@@ -81,11 +81,11 @@ PLAN = FigurePlan(
     "fig4",
     "Figure 4",
     "static load",
-    "Static load test. Measured load against stretch (blue), linear regions of a piecewise-linear "
-    "fit with the number of segments of lowest BIC (green) and their centres (asterisks); for a "
-    "planar HASEL, Arruda-Boyce fit of the shell with the electrodes' spring in parallel (red). "
-    "The yellow band is the region chosen for the experiments; the diamond is the operating point: "
-    "the hung weight, and the stretch at the baseline voltage, which differs from that of the "
-    "curve at 0 V.",
+    "Static load test. Measured load against stretch (blue), linear regions of a "
+    "piecewise-linear fit with the number of segments of lowest BIC (green) and their centres "
+    "(asterisks); for a planar HASEL, Arruda-Boyce fit of the shell with the electrodes' spring "
+    "in parallel (orange-red). The yellow band is the region chosen for the experiments; the "
+    "diamond is the operating point: the hung weight, and the stretch at the baseline voltage, "
+    "which differs from that of the curve at 0 V.",
     (Panel("", "Load against stretch", _static, wide=True, height_in=3.6),),
 )

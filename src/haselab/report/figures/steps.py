@@ -87,10 +87,11 @@ PLAN = FigurePlan(
     "Figure 6",
     "steps",
     "Step experiments. The actuator is first driven to zero strain, then the step follows. In "
-    "open loop it creeps, so its strain differs from zero before the step and from the desired "
-    "strain at the end. A: desired strain (green), and mean of the trials in each mode, measured "
-    "independently by the camera, with one standard deviation as a band. B: each trial (faint), "
-    "and the strain sensed by the controller (thin grey).",
+    "open loop nothing corrects its slow motion and the error of the voltage map, so its strain "
+    "differs from zero before the step and from the desired strain at the end. A: desired strain "
+    "(green), and mean of the trials in each mode, measured independently by the camera, with one "
+    "standard deviation as a band. B: each trial (faint), and the strain sensed by the controller "
+    "(thin grey).",
     (
         Panel("A", "Open and closed loop", _overview, wide=True, height_in=3.2),
         Panel("B", "Trials and self-sensed strain", _each_group, wide=True, height_in=5.0),

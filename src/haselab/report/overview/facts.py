@@ -1,21 +1,28 @@
-"""The main numbers of a run: what the actuator is like, and how its loops behave."""
+"""The main numbers of a run: what the actuator is like."""
 
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator, Mapping
-from dataclasses import dataclass
+from collections.abc import Iterator
+from dataclasses import dataclass, replace
 
 import numpy as np
 
+from haselab.base import Estimate
 from haselab.report.analysis import Array, LeftOutError
 from haselab.report.folder import RunFolder
-from haselab.report.numbers import ABSENT, interval_text, number_text
+from haselab.report.numbers import interval_text, number_text
 from haselab.report.results import Quantity, Results
 
-__all__ = ["Fact", "LoopTable", "facts", "loop_table", "own_kind"]
+__all__ = ["Fact", "facts", "rounded"]
 
 _HZ = 2.0 * math.pi
+_FEEDTHROUGH = (
+    "Feedthrough: fraction of the sensed strain that follows the drive before the actuator moves"
+)
+_UNUSED = (
+    "the margins use 0, because it is small or uncertain, or because the loop measures by camera"
+)
 
 
 @dataclass(frozen=True)
@@ -31,47 +38,6 @@ class Fact:
     what: str
     value: str
     interval: str
-
-
-@dataclass(frozen=True)
-class LoopTable:
-    """How the loops follow a step.
-
-    Args:
-        columns: headings of the cells.
-        rows: name and cells of each loop; a missing cell is a dash.
-    """
-
-    columns: tuple[str, ...]
-    rows: tuple[tuple[str, tuple[str, ...]], ...]
-
-
-# Heading of the column, and factor of its values. The first three are of a trial.
-_CELLS = (
-    ("Rise time 10–90 % (s)", 1.0),
-    ("Overshoot (% of the step)", 100.0),
-    ("Final error (% of the step)", 100.0),
-    ("Phase margin (°)", 1.0),
-    ("Gain margin (dB)", 1.0),
-)
-_OF_TRIAL = 3
-# Ids in the order of the columns.
-_LOOPS = {
-    "Open loop": ("S24.rise_open", "", "S24.error_open", "", ""),
-    "PI": ("S24.rise_closed", "S24.overshoot_closed", "S24.error_closed", "S21.phase_margin",
-           "S21.gain_margin"),
-    "PID": ("S25.rise_pid", "S25.overshoot_pid", "S25.error_pid", "S25.phase_margin",
-            "S25.gain_margin"),
-    "Controller {kind}": ("S25.rise_own", "S25.overshoot_own", "S25.error_own", "", ""),
-    "Observer (physical model)": ("S25.rise_observer", "S25.overshoot_observer",
-                                  "S25.error_observer", "", ""),
-    "Hybrid (physical model)": ("S27.rise_own", "S27.overshoot_own", "S27.error_own", "", ""),
-    "Hybrid, another mass": ("S27.rise_other", "S27.overshoot_other", "S27.error_other", "", ""),
-    "Microcontroller (SIMULATED)": ("S26.rise", "S26.overshoot", "S26.error", "S26.phase_margin",
-                                    ""),
-    "Miniature bench (SIMULATED)": ("S28.rise", "S28.overshoot", "S28.error", "S28.phase_margin",
-                                    ""),
-}  # fmt: skip
 
 
 def facts(run: RunFolder) -> tuple[Fact, ...]:
@@ -90,7 +56,8 @@ def facts(run: RunFolder) -> tuple[Fact, ...]:
             _reach(run),
             _of_row(results, ("S20.omega_n", "S19.omega_0"), "Natural frequency"),
             _of_row(results, ("S20.zeta", "S20.eq8_zeta"), "Damping ratio"),
-            _of_row(results, ("S20.slow_tau",), "Slow motion (creep), time constant"),
+            _slow_motion(results),
+            _feedthrough(run),
             _map_errors(run),
             _sensing_error(run),
         )
@@ -98,39 +65,16 @@ def facts(run: RunFolder) -> tuple[Fact, ...]:
     )
 
 
-def loop_table(results: Results) -> LoopTable | None:
-    """How the loops follow a step; None if no loop was played or designed.
+def rounded(row: Quantity, factor: float) -> tuple[str, str]:
+    """The value with at most four digits, and its interval.
 
     Args:
-        results: checked content of results.json.
+        row: with a value.
+        factor: on both.
+
+    Returns:
+        Both as text.
     """
-    found = {}
-    for name, keys in _LOOPS.items():
-        cells = tuple(
-            _cell(results.get(key), factor) for key, (_, factor) in zip(keys, _CELLS, strict=True)
-        )
-        if set(cells) != {ABSENT}:
-            played = "" if set(cells[:_OF_TRIAL]) != {ABSENT} else ", not played"
-            found[name.format(kind=own_kind(results)) + played] = cells
-    used = [at for at in range(len(_CELLS)) if any(row[at] != ABSENT for row in found.values())]
-    if not used:
-        return None
-    return LoopTable(
-        tuple(_CELLS[at][0] for at in used),
-        tuple((name, tuple(cells[at] for at in used)) for name, cells in found.items()),
-    )
-
-
-def own_kind(results: Results) -> str:
-    """The kind of the study's own controller, in quotation marks."""
-    study = results.provenance.get("study")
-    control = study.get("control") if isinstance(study, Mapping) else None
-    kind = control.get("kind") if isinstance(control, Mapping) else None
-    return f"'{kind}'" if kind else "of [control] kind"
-
-
-def _value(row: Quantity, factor: float) -> tuple[str, str]:
-    """The value with at most four digits, and its interval."""
     assert row.measured is not None
     value, std = factor * row.measured.value, factor * row.measured.std
     ends = [factor * end for end in row.measured.ci95]
@@ -141,24 +85,63 @@ def _value(row: Quantity, factor: float) -> tuple[str, str]:
     return shown, interval
 
 
-def _cell(row: Quantity | None, factor: float) -> str:
-    return ABSENT if row is None or row.measured is None else _value(row, factor)[0]
-
-
 def _of_row(results: Results, keys: tuple[str, ...], what: str) -> Iterator[Fact]:
     """The first of these results that has a value."""
     for key in keys:
         row = results.get(key)
         if row is None or row.measured is None or math.isnan(row.measured.value):
             continue
-        value, interval = _value(row, 1.0)
+        value, interval = rounded(row, 1.0)
         if row.unit == "rad/s":
-            hertz, _ = _value(row, 1.0 / _HZ)
+            hertz, _ = rounded(row, 1.0 / _HZ)
             value = f"{value} rad/s = {hertz} Hz"
         else:
             value = f"{value} {row.unit}".rstrip()
         yield Fact(what, value, f"{interval} {row.unit}".rstrip())
         return
+
+
+def _slow_motion(results: Results) -> Iterator[Fact]:
+    """What follows a fast motion: creep in its direction, or a partial return."""
+    slow, fast, tau = (
+        _measured(results, f"S20.{key}") for key in ("slow_gain", "gain", "slow_tau")
+    )
+    if tau is None:
+        return
+    name, amount = "Slow motion", None
+    if slow is not None and fast is not None and fast.value != 0.0:
+        share = slow.value / fast.value
+        amount = f"{abs(100.0 * share):.2g} % of the fast motion"
+        low, high = slow.ci95
+        if not low * high > 0.0:
+            name = "Slow motion, whose direction is not identifiable"
+        elif share > 0.0:
+            name = "Creep: slow further motion"
+        else:
+            name = "Slow partial return after the fast motion (the opposite of creep)"
+    row = results.get("S20.slow_tau")
+    assert row is not None
+    value, interval = rounded(row, 1.0)
+    parts = [amount, f"time constant {value} s"]
+    yield Fact(name, ", ".join(filter(None, parts)), f"time constant: {interval} s")
+
+
+def _measured(results: Results, key: str) -> Estimate | None:
+    row = results.get(key)
+    found = None if row is None else row.measured
+    return None if found is None or math.isnan(found.value) else found
+
+
+def _feedthrough(run: RunFolder) -> Iterator[Fact]:
+    """How much of the sensed strain is no motion, and whether the loops are designed for it."""
+    for fact in _of_row(run.results, ("S20.feedthrough",), _FEEDTHROUGH):
+        try:
+            used = run.section("loop").section("worst").number("feedthrough")
+        except LeftOutError:
+            yield fact
+            return
+        which = "the margins contain it" if used else _UNUSED
+        yield replace(fact, interval=f"{fact.interval}; {which}")
 
 
 def _reach(run: RunFolder) -> Iterator[Fact]:

@@ -40,7 +40,7 @@ _SUBJECTS = (
         ("S14.zero", "S15.slope", "S15.offset", "S13.residual_first", "S13.peak_drift"),
     ),
     _Subject(
-        "dynamics", "Dynamics: natural frequency, damping and creep", ("S19.", "S20."),
+        "dynamics", "Dynamics: natural frequency, damping and slow motion", ("S19.", "S20."),
         ("S20.omega_n", "S20.zeta", "S20.gain_per_volt", "S20.gain", "S20.slow_gain",
          "S20.slow_tau", "S20.delay", "S19.omega_0"),
     ),

@@ -110,7 +110,9 @@ class SupplyConfig(InstrumentConfig):
     """Section `supply`: a high-voltage supply."""
 
     highest_v: float = Field(gt=0, le=10e3, description="highest output", examples=[3000.0])
-    tolerance_v: float = Field(50.0, gt=0, description="of the supply's own meter")
+    tolerance_v: float = Field(
+        50.0, gt=0, description="largest reading of the supply's own meter while it is off"
+    )
 
 
 class CameraConfig(InstrumentConfig):

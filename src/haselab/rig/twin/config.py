@@ -17,6 +17,7 @@ if TYPE_CHECKING:
 __all__ = [
     "HIGHEST_GAIN_ERROR",
     "HIGHEST_LOAD_KG",
+    "PLANAR_SECTIONS",
     "READINGS",
     "SETTLE_S",
     "AcquisitionConfig",
@@ -37,7 +38,7 @@ __all__ = [
 HIGHEST_LOAD_KG = 20.0
 HIGHEST_GAIN_ERROR = 0.5  # of the current monitor
 SETTLE_S = 120.0  # how long the mass has hung when a study begins
-_PLANAR_SECTIONS = ("shell", "electrodes", "viscosity", "mullins", "hysteresis", "dielectric")
+PLANAR_SECTIONS = ("shell", "electrodes", "viscosity", "mullins", "hysteresis", "dielectric")
 
 
 class Shell(Section):
@@ -230,10 +231,10 @@ class TwinConfig(Section):
             if self.actuator:
                 raise ValueError(
                     f"the table actuator has no effect with kind = {PLANAR_HASEL!r}, whose "
-                    f"parameters are in {', '.join(_PLANAR_SECTIONS)}; set kind, or remove it"
+                    f"parameters are in {', '.join(PLANAR_SECTIONS)}; set kind, or remove it"
                 )
             return self
-        for name in _PLANAR_SECTIONS:
+        for name in PLANAR_SECTIONS:
             section = getattr(self, name)
             if section != type(section)():
                 raise ValueError(

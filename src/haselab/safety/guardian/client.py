@@ -96,9 +96,9 @@ class _Process:
                 verb, _, rest = word.partition(" ")
                 self.acting = True
                 if verb == "acted":
-                    self.result = f"{self.name} made the bench safe: {rest}."
+                    self.result = f"{self.name} took the bench to 0 V: {rest}."
                 elif verb == "tried":
-                    self.result = f"{self.name} could not make the bench safe ({rest})."
+                    self.result = f"{self.name} could not take the bench to 0 V ({rest})."
                     self.fault = rest
 
     def lost(self, beats: int, now_s: float) -> str:

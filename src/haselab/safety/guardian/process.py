@@ -195,7 +195,7 @@ def main(words: list[str]) -> str:
         try:
             guardian = _Guardian(file, link, slot, log)
         except OSError as error:
-            _say(f"failed the interlock cannot be used: {error}")
+            _say(f"failed the software interlock cannot be used: {error}")
             return str(error)
         signal.signal(signal.SIGTERM, guardian.ended)
         _raise_priority()

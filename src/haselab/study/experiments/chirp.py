@@ -31,6 +31,7 @@ __all__ = ["ChirpTest"]
 _PER_VOLT = {"S20.gain_per_volt": Quantity("plant, gain from the drive voltage", "1/V")}
 _ABOUT = "strain for a volt before the amplifier, about the baseline; no voltage map is known"
 _NO_SLOW = "the open-loop trials do not determine a slow branch of the plant"
+_RETURN = "no creep, but a slow partial return after the fast motion: S20.gain has the other sign"
 _LEAD_S = 1.0  # recorded at the baseline before the chirp
 
 
@@ -82,8 +83,9 @@ class ChirpTest(Experiment[Chirp]):
         both = fit_chirp_and_steps(seen, opened, maps, self.study, analysis.rig, near)
         missing = {key: _NO_SLOW for key in self.rows() if key not in both.quantities}
         return ExperimentResult(
-            both.quantities, figures=both.figures, values=(both,), missing=missing
-        )
+            both.quantities, _slow_notes(both.quantities), figures=both.figures, values=(both,),
+            missing=missing,
+        )  # fmt: skip
 
     def _alone(
         self, quantities: Mapping[str, Estimate], figures: Mapping[str, object], needs: str
@@ -100,3 +102,11 @@ class ChirpTest(Experiment[Chirp]):
         """See `Experiment`; without a triangle, the gain from the drive voltage too."""
         rows = paper_rows("S20.")
         return rows if self.study.has("triangle") else {**rows, **_PER_VOLT}
+
+
+def _slow_notes(found: Mapping[str, Estimate]) -> dict[str, str]:
+    """Say that a slow branch of the other sign is no creep."""
+    slow, fast = found.get("S20.slow_gain"), found.get("S20.gain")
+    if slow is None or fast is None or slow.value * fast.value >= 0.0:
+        return {}
+    return {"S20.slow_gain": _RETURN}

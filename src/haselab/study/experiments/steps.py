@@ -8,7 +8,7 @@ from dataclasses import replace
 
 import numpy as np
 
-from haselab.base import InputError, ResultError
+from haselab.base import InputError, JsonObject, ResultError, table_at
 from haselab.controllers import KnownActuator
 from haselab.rig import RigDescription
 from haselab.runtime.loop import LoopSettings
@@ -17,6 +17,8 @@ from haselab.signals import constant
 from haselab.study.analysis import Analysis
 from haselab.study.definition import Study
 from haselab.study.experiment import Experiment, ExperimentResult
+from haselab.study.experiments.predicted import map_errors, predicted_metrics
+from haselab.study.fits.dynamics import Dynamics
 from haselab.study.fits.further import further_trials, rows_without, saturating_reference
 from haselab.study.fits.loops import Loops, loop_saturation
 from haselab.study.fits.maps import Maps, require_open_steps
@@ -206,15 +208,29 @@ class StepTest(Experiment[Steps]):
         closed = {name: seen[group] for group, name in _COMPARED.items() if group in seen}
         found = compare_trials({"open loop": opened, **closed}, maps, self.study, scale)
         found = replace(found, failed={**lost, **found.failed})
+        predictions = self._predictions(analysis, loops, found)
         further = further_trials(seen, found.groups.get("PI"), maps, loops, self.study, scale)
         reasons = {key: why for key in self.rows() if (why := found.reason(key))}
         return ExperimentResult(
             {**found.quantities, **further.quantities},
             {**found.notes, **further.notes},
-            figures={**found.figures, **further.figures},
+            figures={
+                **found.figures,
+                **further.figures,
+                "steps": {**table_at(found.figures, "steps"), **predictions},
+            },
             values=(found,),
             missing={**reasons, **further.missing, **rows_without(lost)},
         )
+
+    def _predictions(self, analysis: Analysis, loops: Loops, found: Comparison) -> JsonObject:
+        """Metrics that the plant predicts, and what the strain map explains of final errors."""
+        plant = analysis.need(Dynamics).plant
+        predictions: JsonObject = {"predicted": predicted_metrics(found.groups, plant, loops)}
+        if self.settings.feedback == "capacitance":
+            closed = {name: seen for name, seen in found.groups.items() if name in ("PI", "PID")}
+            predictions["map_error"] = map_errors(closed)
+        return predictions
 
     def _closed_trials(
         self, analysis: Analysis, groups: Sequence[str]

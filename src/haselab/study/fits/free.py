@@ -27,6 +27,14 @@ _ONE_TRIAL = (
     "one trial: the interval only includes how the decay changes if the last peak is left out, not "
     "the scatter between trials"
 )
+_TWO_PEAKS = (
+    "one trial with two peaks, which determine an exponential exactly, so there is no interval. "
+    "Play more trials"
+)
+_NO_SCATTER = (
+    "one trial: no interval, because it would be the scatter between trials. Play more trials"
+)
+_EQ_6 = ("S19.eq6_omega_d", "S19.eq6_decay", "S19.eq6_rms")
 _LEAST_PEAKS = 2  # of one sign, through which an envelope is drawn
 _LEAST_PEAK = 0.03  # of the amplitude: smaller peaks are below the residuals of eq. 6
 
@@ -39,7 +47,7 @@ class Envelope:
 
     Args:
         decay: in 1/s.
-        moved: change of the decay without the last peak, in 1/s.
+        moved: change of the decay without the last peak, in 1/s; NaN with only two peaks.
         amplitude_m: at the first sample, in m, positive for either sign.
         peak_s: times of the peaks from the first sample, shape `(P,)`.
         peak_m: their distances from rest, in m, positive for either sign, shape `(P,)`.
@@ -154,7 +162,7 @@ def _envelope(time_s: Floats, moved_m: Floats, amplitude_m: float, omega: float)
         return None
     at_s, logarithm = time_s[peaks], np.log(moved_m[peaks])
     slope, intercept = (float(value) for value in np.polyfit(at_s, logarithm, 1))
-    moved = 0.0  # unknown with only two peaks
+    moved = math.nan  # two peaks determine an exponential, and nothing is left over
     if peaks.size > _LEAST_PEAKS:
         moved = abs(slope - float(np.polyfit(at_s[:-1], logarithm[:-1], 1)[0]))
     return Envelope(-slope, moved, math.exp(intercept), at_s, moved_m[peaks])
@@ -207,10 +215,12 @@ def fit_free(trials: Sequence[Observation], near: Free | None = None) -> Free:
             "S19.eq6_rms": _repeated(np.array([p.rms_m for p in printed]), "m"),
         },
         notes={
+            **(_notes_of_one(printed[0]) if len(printed) == 1 else {}),
             "S19.omega_0": f"{_model(fit)}; the rms residual is "
             f"{1e3 * float(np.sqrt(np.mean(left_m**2))):.2g} mm",
-            "S19.eq6_omega_0": "decaying oscillation without a creep term" + _missing(printed),
-            **(dict.fromkeys(_envelope_decays(printed), _ONE_TRIAL) if len(printed) == 1 else {}),
+            "S19.eq6_omega_0": "decaying oscillation without a creep term"
+            + _missing(printed)
+            + (f"; {_NO_SCATTER}" if len(printed) == 1 else ""),
         },
         figures={"free_response": _figure(trials, records, fit, printed)},
     )
@@ -228,10 +238,22 @@ def _envelope_decays(printed: Sequence[PrintedFit]) -> dict[str, Estimate]:
         drawn = [envelope for p in printed if (envelope := p.envelopes[k]) is not None]
         if len(drawn) == len(printed):
             rates, moves = np.array([(one.decay, one.moved) for one in drawn]).T
-            found[f"S19.eq6_decay_{k + 1}"] = with_resolution(
-                _repeated(rates, "1/s"), float(moves.mean())
+            scattered, known = _repeated(rates, "1/s"), moves[np.isfinite(moves)]
+            found[f"S19.eq6_decay_{k + 1}"] = (
+                with_resolution(scattered, float(known.mean())) if known.size else scattered
             )
     return found
+
+
+def _notes_of_one(fit: PrintedFit) -> dict[str, str]:
+    """What the intervals of a single trial lack, by id."""
+    notes = dict.fromkeys(_EQ_6, _NO_SCATTER)
+    for k, envelope in enumerate(fit.envelopes):
+        if envelope is not None:
+            notes[f"S19.eq6_decay_{k + 1}"] = (
+                _TWO_PEAKS if math.isnan(envelope.moved) else _ONE_TRIAL
+            )
+    return notes
 
 
 def _missing(printed: Sequence[PrintedFit]) -> str:
@@ -241,7 +263,7 @@ def _missing(printed: Sequence[PrintedFit]) -> str:
         for k, name in enumerate(("positive", "negative"))
         if any(p.envelopes[k] is None for p in printed)
     ]
-    return f"; too few {' and '.join(gone)} peaks exceed the creep" if gone else ""
+    return f"; too few {' and '.join(gone)} peaks exceed creep and noise" if gone else ""
 
 
 def _trial(seen: Observation) -> FreeTrial:

@@ -19,6 +19,7 @@ from haselab.control import (
 )
 from haselab.control.feedthrough import with_measured_feedthrough
 from haselab.control.plants.general import AnyPlant
+from haselab.control.plants.general_loops import loop_variants
 from haselab.control.reach import reachable_range
 from haselab.control.stability.margins import loop_margins
 from haselab.models.maps import VoltageMap
@@ -265,7 +266,7 @@ def design_loops(
     quantities = {
         f"{prefix}{name}": value for prefix, part in judged.items() for name, value in part.items()
     }
-    figure = _figure(found.plant, pi, pid, setting) | {
+    figure = _figure(found.plant, pi, pid, setting, demands.frequency_spread) | {
         "output_s": {"nominal": _nominal_s(rig), "measured": output}
     }
     return Loops(
@@ -379,22 +380,32 @@ def margin_estimates(
     }
 
 
-def _figure(plant: Plant, pi: PidGains, pid: PidGains, setting: LoopSetting) -> dict[str, Any]:
+def _figure(
+    plant: Plant, pi: PidGains, pid: PidGains, setting: LoopSetting, spread: float
+) -> dict[str, Any]:
     wn = plant.natural_frequency_rad_s
     omega_rad_s = np.unique(
         np.concatenate([np.geomspace(0.05, 300.0, 400), wn * np.linspace(0.8, 1.2, 80)])
     )
     open_response = plant.frequency_response(omega_rad_s)
     held = np.exp(-1j * omega_rad_s * (setting.measurement_delay_s + 0.5 / setting.rate_hz))
+    sensed = open_response
+    if share := setting.feedthrough:
+        direct = plant.static_gain * np.exp(-1j * omega_rad_s * plant.delay_s)
+        sensed = (1.0 - share) * open_response + share * direct
+    variants = loop_variants(plant, setting, spread)
     controllers = {}
     for name, gains in (("PI", pi), ("PID", pid)):
-        loop = open_response * held * gains.sampled_response(omega_rad_s, setting.rate_hz)
+        loop = sensed * held * gains.sampled_response(omega_rad_s, setting.rate_hz)
         m = loop_margins(plant, gains, setting)
+        every = [loop_margins(one, gains, loop_of_one) for one, loop_of_one in variants]
         controllers[name] = {
             "magnitude": np.abs(loop),
             "phase_rad": np.unwrap(np.angle(loop)),
             "phase_margin_deg": m.phase_margin_deg,
             "gain_margin_db": m.gain_margin_db,
+            "worst_phase_margin_deg": min(one.phase_margin_deg for one in every),
+            "worst_gain_margin_db": min(one.gain_margin_db for one in every),
             "crossover_rad_s": m.crossover_rad_s,
             "kp": gains.kp,
             "ki": gains.ki,
@@ -408,4 +419,9 @@ def _figure(plant: Plant, pi: PidGains, pid: PidGains, setting: LoopSetting) -> 
             "phase_rad": np.unwrap(np.angle(open_response)),
         },
         "controllers": controllers,
+        "worst": {
+            "frequency_spread": spread,
+            "feedthrough": setting.feedthrough,
+            "feedthrough_range": setting.feedthrough_range,
+        },
     }

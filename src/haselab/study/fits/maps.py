@@ -24,9 +24,9 @@ __all__ = ["Maps", "fit_maps", "require_open_steps"]
 _SAME_V = 1e-9  # rounding of a voltage from the map
 _COMPARED = (-0.05, 0.10)  # range of the printed saturation, where two maps are compared
 _INSEPARABLE = (
-    "not identifiable from this loop, which does not separate two exponentials; its interval only "
-    "serves the comparison with the noise-free fit. The curve itself is identifiable (S14.zero, "
-    "figure 3)"
+    "not identifiable alone, because this loop does not separate the two exponentials: use no "
+    "coefficient by itself. Its interval, if there is one, only serves the comparison with the "
+    "noise-free fit. The curve of all four is well determined (S14.zero, figure 3)"
 )
 
 Floats = NDArray[np.float64]
@@ -201,6 +201,8 @@ def _figures(
     start_s = seen.block_start_s[0]
     blocks = slice(None, None, max(1, len(relative) // 1000))
     counted = np.flatnonzero(seen.sensed_s >= cycles.from_s)[blocks]
+    sensed_f = seen.capacitance_f[counted]
+    farad = np.linspace(np.nanmin(sensed_f), np.nanmax(sensed_f), 120)
     return {
         "triangle": {
             "time_s": seen.frame_time_s[thin] - start_s,
@@ -224,6 +226,9 @@ def _figures(
             "each_strain": at_block[counted],
             "fit_relative_capacitance": ends,
             "fit_strain": line[0] * ends + line[1],
+            "each_capacitance_f": sensed_f,
+            "map_capacitance_f": farad,
+            "map_strain": maps.strain_map.strain(farad),
             "time_s": seen.sensed_s[blocks] - start_s,
             "strain_time": at_block[blocks],
             "reconstructed_strain": maps.strain_map.strain(seen.capacitance_f[blocks]),

@@ -142,12 +142,15 @@ def _sensing() -> dict[str, Quantity]:
             "",
             4.923e6,
             paper_note=f"edges averaged over time, as in the paper; {eq_2}",
+            planar_only=True,
         ),
-        "S15.offset": Quantity("eq. 5, offset", "", -0.276),
+        "S15.offset": Quantity("eq. 5, offset", "", -0.276, planar_only=True),
         "S15.slope_at_strain": Quantity(
-            "eq. 5, slope, edges averaged at equal strain", "", paper_note=eq_2
+            "eq. 5, slope, edges averaged at equal strain", "", paper_note=eq_2, planar_only=True
         ),
-        "S15.offset_at_strain": Quantity("eq. 5, offset, edges averaged at equal strain", ""),
+        "S15.offset_at_strain": Quantity(
+            "eq. 5, offset, edges averaged at equal strain", "", planar_only=True
+        ),
     }
 
 

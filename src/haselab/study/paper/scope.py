@@ -6,6 +6,7 @@ from collections.abc import Collection, Iterator, Mapping
 from typing import Any
 
 from haselab.base import JsonObject
+from haselab.rig.protocols import PLANAR_HASEL
 from haselab.study.definition import Study, builtin_study
 from haselab.study.results import rows_of
 from haselab.study.simulated.truth import identified_as, with_default_twin
@@ -33,6 +34,7 @@ _COUNTED = {
                   "S24.overshoot_closed"),
     "pid_trials": ("S25.rise_pid", "S25.overshoot_pid", "S25.error_pid"),
 }  # fmt: skip
+_EXTRA = ("paper_chain_trials", "extra_delay_trials", "saturating_trials")  # 0 by default
 _ON_CHIP = {"chip": "S26", "miniature": "S28"}  # sections of analysis.json, see `chip_rows`
 
 
@@ -41,6 +43,7 @@ def not_played(
     figures: Mapping[str, Any],
     study: Study,
     missing: Mapping[str, str] | None = None,
+    kind: str = PLANAR_HASEL,
 ) -> list[JsonObject]:
     """List results of a study's experiments that a run does not have, with the reasons.
 
@@ -49,16 +52,27 @@ def not_played(
         figures: sections of analysis.json, which state why a chip's experiment is missing.
         study: the study that was played.
         missing: why a fit did not give a result, by id.
+        kind: of the actuator.
     Returns:
-        Section `not_played` of results.json: `ids` and `reason`, grouped by reason.
+        Section `not_played` of results.json: `ids` and `reason`, grouped by reason. Trials in
+        addition to the usual ones, such as those with the paper's sensing, are no part of another
+        study that does not request them.
     """
     found: dict[str, list[str]] = {}
     known = missing or {}
-    for key in rows_of(study):
-        if key not in measured:
+    for key in rows_of(study, kind):
+        if key not in measured and (study.is_reference or not _is_extra(key, study)):
             reason = _left_out(key, study) or known.get(key) or _reason(key, figures, study)
             found.setdefault(reason, []).append(key)
     return [{"ids": ids, "reason": reason} for reason, ids in found.items()]
+
+
+def _is_extra(key: str, study: Study) -> bool:
+    """Whether a result is that of additional trials that a study does not request."""
+    return any(
+        key in _COUNTED[setting] and study.has("steps") and not getattr(study.steps, setting)
+        for setting in _EXTRA
+    )
 
 
 def _left_out(key: str, study: Study) -> str:
@@ -79,7 +93,7 @@ def _reason(key: str, figures: Mapping[str, Any], study: Study) -> str:
     if row == "S16" and (left_out := figures.get("static", {}).get("left_out")):
         return str(left_out)
     if key.startswith("S19.eq6_decay_"):
-        return "too few peaks exceed the creep (S19.eq6_omega_0)."
+        return "too few peaks exceed creep and noise (S19.eq6_omega_0)."
     return "no result from the recorded data."
 
 

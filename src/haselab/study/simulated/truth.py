@@ -10,7 +10,7 @@ from pydantic import ValidationError
 
 from haselab.base import JsonObject
 from haselab.rig.protocols import PLANAR_HASEL
-from haselab.rig.twin.config import TwinConfig, twin_of_reading
+from haselab.rig.twin.config import PLANAR_SECTIONS, TwinConfig, twin_of_reading
 
 __all__ = [
     "follows_from_twin",
@@ -19,6 +19,7 @@ __all__ = [
     "parameters",
     "set_in_twin",
     "twin_of",
+    "used_configuration",
     "with_default_twin",
 ]
 
@@ -63,13 +64,30 @@ _FOLLOWS = {
 
 
 def twin_of(rig_config: Mapping[str, Any]) -> TwinConfig | None:
-    """The twin in a session's header; None for another rig."""
-    if "shell" not in rig_config or "electrodes" not in rig_config:
+    """The twin in a session's header, or in the provenance of results; None for another rig."""
+    planar = "shell" in rig_config and "electrodes" in rig_config
+    if not planar and not {"kind", "actuator", "amplifier", "acquisition"} <= set(rig_config):
         return None
     try:
         return TwinConfig.model_validate(rig_config)
     except ValidationError:
         return None
+
+
+def used_configuration(rig_config: Mapping[str, Any]) -> Mapping[str, Any]:
+    """The configuration of a rig without the parts of a twin that describe no part of it.
+
+    Args:
+        rig_config: of a session's header, where a twin of another kind has the default shell,
+            electrodes and so on of the planar HASEL, too.
+    Returns:
+        What had an effect.
+    """
+    twin = twin_of(rig_config)
+    if twin is None or twin.kind == PLANAR_HASEL:
+        return rig_config
+    unused = {*PLANAR_SECTIONS, "reading"}
+    return {key: value for key, value in rig_config.items() if key not in unused}
 
 
 def with_default_twin(

@@ -24,7 +24,11 @@ from haselab.actuators.response import ADDED_INERTIA
 from haselab.base import InputError
 from haselab.identify.physical.misfit import CAPACITANCE, LENGTH, TRACKED_ZERO_M, Misfit
 from haselab.identify.physical.misstated import WrongScale, find_wrong_scale, suspect_scale
-from haselab.identify.physical.plausible import find_implausible, motion_before_drive
+from haselab.identify.physical.plausible import (
+    find_implausible,
+    judge_estimates,
+    motion_before_drive,
+)
 from haselab.identify.physical.record import MotionRecord
 from haselab.identify.physical.residuals import (
     channel_of,
@@ -93,7 +97,7 @@ def fit_actuator(
     """
     if not records:
         raise InputError("There is no record of the actuator's motion. Give at least one.")
-    if fault := find_implausible(law, records):
+    if fault := find_implausible(law, records, added_inertia_kg or 0.0):
         return ActuatorFit(status=fault, kind=law.kind)
     known = {CAMERA_OFFSET: camera_bias_m, CAMERA_SCALE: camera_scale_std}
 
@@ -108,7 +112,14 @@ def fit_actuator(
         if fit.contradicted:
             others = (fit_from(share * mass_kg) for share in _LARGE_INERTIAS)
             fit = _with_large_inertia(fit, others, mass_kg)
-    if not fit.succeeded:
+    if fit.succeeded:
+        begun_kg = _USUAL_INERTIA * mass_kg if added_inertia_kg is None else added_inertia_kg
+        sensed = any(record.capacitance_f.size for record in records)
+        fault, note = judge_estimates(law, fit, start_inertia_kg=begun_kg, sensed=sensed)
+        if fault:
+            return ActuatorFit(status=fault, kind=law.kind, evaluations=fit.evaluations)
+        fit = replace(fit, notes=(*fit.notes, note)) if note else fit
+    else:
         for remark in (remark for record in records for remark in record.repeated_remarks):
             fit = replace(fit, status=f"{fit.status}. {remark}. Record with finer steps")
     if moving := motion_before_drive(records):

@@ -39,14 +39,20 @@ CHANNELS = ("camera", "capacitance", "both")
 # the word that the status or a note must have, by what is wrong
 WORDS = {
     "none": ("",),
-    "time": ("times", "unit of time", "frame rate", "clock"),
+    "time": (
+        "all times were",
+        "times that are stated",
+        "unit of the times",
+        "unit of time",
+        "frame rate",
+    ),
     "mass": ("mass",),
     "voltage": ("gain", "volt"),
     "length": ("length", "scale of the camera"),
 }
 FACTORS = (1000.0, 60.0, 10.0, 2.0, 0.5, 0.1, 1.0 / 60.0, 0.001)
 _NOISE_M, _NOISE_F = 4e-6, 3e-13  # of tables
-_GENERAL = "Without capacitances"  # begins the note that each record of a camera alone has
+_GENERAL = ("Without capacitances", "Without lengths")  # begin the notes that all such records have
 _CLOCK, _ZERO_M = 1e-3, 5e-5  # what the command assumes of tables
 
 
@@ -191,7 +197,7 @@ class Case:
 def _verdict(fault: str, fit: ActuatorFit) -> tuple[str, str]:
     """In one word and in those of the fit."""
     notes = [note for note in fit.notes if not note.startswith(_GENERAL)]
-    general = len(notes) < len(fit.notes)
+    general = [note.lower() for note in fit.notes if note.startswith(_GENERAL)]
     said = " | ".join([fit.status, *notes])
     if fault == "none":
         return ("accepted" if fit.parameters else "REFUSED"), said
@@ -200,8 +206,9 @@ def _verdict(fault: str, fit: ActuatorFit) -> tuple[str, str]:
         return ("named" if names else "refused"), said
     if fit.status != "ok" or notes:
         return ("warned" if names else "doubted"), said
-    # the note of a camera alone names the gain, the mass and the scale
-    return ("general" if general and fault != "time" else "SILENT"), said
+    # what all records of a camera alone, or of capacitances alone, are told
+    known = any(word in note for note in general for word in WORDS[fault])
+    return ("general" if known else "SILENT"), said
 
 
 def _wrong(fit: ActuatorFit, truth: dict[str, float]) -> str:

@@ -46,7 +46,7 @@ _LOGARITHMS = np.arange(-9.2, 9.2, 0.02)  # of the factors that are tried
 _LEAST = {"mass": 2, "gain": 1, "time": 2, "length": 1}  # parameters of a pattern
 _NOTED = {"mass": 1.6, "gain": 1.6, "time": 3.0, "length": 1.4}  # factor of a note
 _REFUSED = {"mass": 4.0, "gain": 2.2}  # and from which the numbers would mean nothing
-_LIGHT, _SURE = 0.2, 5.0  # inertia that lacks, over the hung mass; over its standard deviation
+_LIGHT, _SURE = 0.2, 2.5  # inertia that lacks, over the hung mass; over its standard deviation
 _SAYS = {
     "mass": "A mass that is stated {factor} times too {more} has the same effect",
     "gain": "A voltage, or a gain of the amplifier, that is stated {factor} times too {more} has "
@@ -89,7 +89,10 @@ def _too_light(start: ActuatorLaw, fit: ActuatorFit) -> str:
     """Whether less moves than hangs."""
     added, own_kg = fit.parameters[ADDED_INERTIA], start.moving_mass_kg
     lacking_kg = -(added.value + own_kg)
-    if not lacking_kg > max(_LIGHT * fit.mass_kg, _SURE * added.std):
+    # also of one that is not identifiable, whose stated deviation is infinite
+    at = list(fit.parameters).index(ADDED_INERTIA)
+    std_kg = math.sqrt(float(fit.covariance[at, at]))
+    if not lacking_kg > max(_LIGHT * fit.mass_kg, _SURE * std_kg):
         return ""
     share = max(1.0 - lacking_kg / fit.mass_kg, 1e-6)
     return (

@@ -38,7 +38,7 @@ class StartLaw:
     def __init__(self, law: ActuatorLaw, added_inertia_kg: float = 0.0) -> None:
         self.law, self.added_inertia_kg = law, added_inertia_kg
         self._tables: dict[float, SampledLaw] = {}
-        self._rests: dict[tuple[float, float, float, float], NDArray[np.void]] = {}
+        self._rests: dict[tuple[float, float, float, float], NDArray[np.void] | None] = {}
 
     def simulated(
         self, record: MotionRecord, time_scale: float = 1.0, inertia: float = 0.0
@@ -56,24 +56,38 @@ class StartLaw:
         acts = (float(drive.voltage_v[0]), float(drive.ripple_v2[0]), float(drive.load_n[0]))
         slower = replace(drive, edge_s=time_scale * drive.edge_s)
         seen_s = np.clip(time_scale * record.length_time_s, slower.edge_s[0], slower.edge_s[-1])
+        begun = self._begun(highest_v, acts)
+        if begun is None:
+            return None
+        table, rest = begun
+        table.parameters["inertia_kg"] = (
+            motion_parameters(self.law)["inertia_kg"]
+            + self.added_inertia_kg
+            + inertia * drive.mass_kg.max()
+        )
         try:
-            if highest_v not in self._tables:
-                self._tables[highest_v] = SampledLaw(self.law, highest_v)
-            table = self._tables[highest_v]
-            if (highest_v, *acts) not in self._rests:
-                self._rests[highest_v, *acts] = table.at_rest(*acts)[0]
-            table.parameters["inertia_kg"] = (
-                motion_parameters(self.law)["inertia_kg"]
-                + self.added_inertia_kg
-                + inertia * drive.mass_kg.max()
-            )
-            start = self._rests[highest_v, *acts].copy()
-            found = table.respond(slower, seen_s, start, sensed=record.sensed)
+            found = table.respond(slower, seen_s, rest.copy(), sensed=record.sensed)
         except HaselabError:
             return None
         if not record.capacitance_f.size:
             return found.length_m, np.zeros(0)
         return found.length_m, record.over_windows(found.capacitance_f[record.sensed])
+
+    def _begun(
+        self, highest_v: float, acts: tuple[float, float, float]
+    ) -> tuple[SampledLaw, NDArray[np.void]] | None:
+        """Table and state at rest under voltage, ripple and load; None where there is none."""
+        if (highest_v, *acts) not in self._rests:
+            try:
+                if highest_v not in self._tables:
+                    self._tables[highest_v] = SampledLaw(self.law, highest_v)
+                rest = self._tables[highest_v].at_rest(*acts)[0]
+            except HaselabError:
+                self._rests[highest_v, *acts] = None
+            else:
+                self._rests[highest_v, *acts] = rest
+        found = self._rests[highest_v, *acts]
+        return None if found is None else (self._tables[highest_v], found)
 
 
 @dataclass(frozen=True)

@@ -52,17 +52,22 @@ def find_wrong_times(law: StartLaw, record: MotionRecord) -> str:
     )
 
 
-def follows_with_inertia(law: StartLaw, glimpse: Glimpse, wanted: float = 1.0) -> bool:
+def follows_with_inertia(law: StartLaw, glimpse: Glimpse, wanted: float | None = None) -> bool:
     """Whether the values follow the drive as those of an actuator with a large inertia do.
 
     Args:
         law: at the start values.
         glimpse: of the motion.
-        wanted: correlation of another explanation, which an inertia nearly as good excludes.
+        wanted: correlation of another explanation, which an inertia nearly as good excludes;
+            None: there is no other one.
     """
     for inertia in _INERTIAS:
         found = _tuned_agreement(law, glimpse, 1.0, inertia)
-        if found > _FOLLOWS or _AS_GOOD * _unexplained(found) < _unexplained(wanted):
+        if wanted is None:
+            follows = found > _FOLLOWS
+        else:
+            follows = _AS_GOOD * _unexplained(found) < _unexplained(wanted)
+        if follows:
             return True
     return False
 

@@ -24,7 +24,11 @@ from haselab.actuators.response import ADDED_INERTIA
 from haselab.base import InputError
 from haselab.identify.physical.misfit import CAPACITANCE, LENGTH, TRACKED_ZERO_M, Misfit
 from haselab.identify.physical.misstated import WrongScale, find_wrong_scale, suspect_scale
-from haselab.identify.physical.plausible import find_implausible, motion_before_drive
+from haselab.identify.physical.plausible import (
+    find_implausible,
+    judge_estimates,
+    motion_before_drive,
+)
 from haselab.identify.physical.record import MotionRecord
 from haselab.identify.physical.residuals import (
     channel_of,
@@ -52,6 +56,7 @@ _SAME_NOISE = 0.02
 _USUAL_INERTIA = 0.05  # clamp and linkage over the hung mass
 # Added inertia over the hung mass: further starts, if the records contradict the model.
 _LARGE_INERTIAS = (1.0, 4.0)
+_NOTED_INERTIA, _SEEN_INERTIA = 0.7, 2.0  # which a note mentions; in its standard deviations
 _MOST_INERTIA = 4.0  # of them, that is accepted: a time that is wrong by 2 imitates 3
 _SAME_EFFECT = "A wrong mass or a wrong unit of time has the same effect"
 _APART = 2.0  # rms over noise from which records are compared alone
@@ -95,7 +100,7 @@ def fit_actuator(
     """
     if not records:
         raise InputError("There is no record of the actuator's motion. Give at least one.")
-    if fault := find_implausible(law, records):
+    if fault := find_implausible(law, records, added_inertia_kg or 0.0):
         return ActuatorFit(status=fault, kind=law.kind)
     known = {CAMERA_OFFSET: camera_bias_m, CAMERA_SCALE: camera_scale_std}
 
@@ -111,7 +116,16 @@ def fit_actuator(
             on_stage("search with a larger added inertia")
             others = (fit_from(share * mass_kg) for share in _LARGE_INERTIAS)
             fit = _with_large_inertia(fit, others, mass_kg)
-    if not fit.succeeded:
+    if fit.succeeded:
+        begun_kg = _USUAL_INERTIA * mass_kg if added_inertia_kg is None else added_inertia_kg
+        sensed = any(record.capacitance_f.size for record in records)
+        fault, note = judge_estimates(law, fit, start_inertia_kg=begun_kg, sensed=sensed)
+        if fault:
+            return ActuatorFit(status=fault, kind=law.kind, evaluations=fit.evaluations)
+        fit = replace(fit, notes=(*fit.notes, note)) if note else fit
+        if added_inertia_kg is None:
+            fit = _with_inertia_note(fit, mass_kg)
+    else:
         for remark in (remark for record in records for remark in record.repeated_remarks):
             fit = replace(fit, status=f"{fit.status}. {remark}. Record with finer steps")
     if moving := motion_before_drive(records):
@@ -137,14 +151,24 @@ def _with_large_inertia(
     inertia = found.parameters[ADDED_INERTIA]
     times = inertia.value / mass_kg
     if ADDED_INERTIA not in found.not_identifiable and times <= _MOST_INERTIA:
-        note = f"The added inertia is {times:.2g} times the hung mass. {_SAME_EFFECT}; check both."
-        return replace(found, notes=(note, *found.notes))
+        return found
     said = (
         f"An added inertia of {inertia.value:.2g} kg, {times:.2g} times the hung mass, would "
         f"explain them. {_SAME_EFFECT}. Check both; if they are right, begin there with "
         f"--added-inertia-kg {inertia.value:.2g}"
     )
     return replace(fit, status=f"{fit.status}. {said}")
+
+
+def _with_inertia_note(fit: ActuatorFit, mass_kg: float) -> ActuatorFit:
+    """The fit with a note if it has a large inertia that nobody stated."""
+    times, at = fit.parameters[ADDED_INERTIA].value / mass_kg, list(fit.parameters)
+    # one that is not identifiable has no finite deviation there
+    std = float(fit.covariance.diagonal()[at.index(ADDED_INERTIA)]) ** 0.5 / mass_kg
+    if times < max(_NOTED_INERTIA, _SEEN_INERTIA * std):
+        return fit
+    note = f"The added inertia is {times:.2g} times the hung mass. {_SAME_EFFECT}; check both."
+    return replace(fit, notes=(note, *fit.notes))
 
 
 def _fit(
@@ -209,6 +233,12 @@ def _fit(
     if scaled is None:
         misfit, found, more, scaled = _with_effects(misfit, start, found)
         rejected += more
+    if scaled is not None and scaled.negligible:
+        # no wrong scale: on its way, the search has found a better minimum
+        nearer = refine(misfit, scaled.found.unknowns, found.evaluations)
+        if nearer is not None and rms_of([nearer.residuals]) < rms_of([found.residuals]):
+            misfit, found = _weighed(misfit, nearer.unknowns, nearer)
+        scaled = None
     if scaled is not None:
         misfit, found = _weighed(scaled.misfit, scaled.found.unknowns, scaled.found)
     seen = channel_residuals(misfit, found)

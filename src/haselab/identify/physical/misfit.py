@@ -36,6 +36,7 @@ __all__ = [
     "ModelledRecord",
     "Segment",
     "SharedErrors",
+    "highest_of",
     "least_explained",
     "model_record",
 ]
@@ -98,7 +99,7 @@ def model_record(
     names = unknowns.law_names if derivatives else ()
     sampled = SampledLaw(
         law,
-        _highest_v(record),
+        highest_of(record),
         names,
         added_inertia_kg=added_kg,
         drifts=unknowns.drifts,
@@ -142,7 +143,8 @@ def model_record(
     return ModelledRecord(length_m, scale * inside, length_by, capacitance_by)
 
 
-def _highest_v(record: MotionRecord) -> float:
+def highest_of(record: MotionRecord) -> float:
+    """Voltage up to which a law is tabulated for a record: whole kV, above its highest one."""
     drive = record.drive
     peak_v = np.abs(drive.voltage_v) + np.sqrt(2.0 * drive.ripple_v2)
     return float(np.ceil(peak_v.max() / 1e3 + 1.0) * 1e3)

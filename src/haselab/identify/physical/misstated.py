@@ -185,6 +185,11 @@ class WrongScale:
     instead_of: str
 
     @property
+    def negligible(self) -> bool:
+        """Whether the scale is right."""
+        return abs(self.found.unknowns.value(CAMERA_SCALE) - 1.0) < _SUSPECTED
+
+    @property
     def status(self) -> str:
         """The model error that it is."""
         scale = self.found.unknowns.value(CAMERA_SCALE)

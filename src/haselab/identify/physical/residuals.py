@@ -209,4 +209,11 @@ def notes_of(
             "of the gain changes the permittivity by 2 %, and a mass of one record that is stated "
             "3 to 10 % too high moved the shear modulus of a stack by 50 to 250 times its interval."
         )
+    if not any(record.length_m.size for record in records):
+        notes.append(
+            "Without lengths, the fit cannot detect a wrong gain or mass, nor a wrong unit of the "
+            "times if no vibration is seen, and the intervals do not include such errors. For "
+            "example, a mass of a stack that was stated 2 times too low halved its shear modulus; "
+            "times that were stated 2 times too long doubled its relaxation times and damping."
+        )
     return tuple(notes)

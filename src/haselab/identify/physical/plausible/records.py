@@ -12,10 +12,10 @@ from numpy.typing import NDArray
 from scipy.special import fdtrc
 
 from haselab.actuators import ActuatorLaw, equilibrium_m
-from haselab.base import HaselabError, LimitError
-from haselab.identify.physical.misfit import model_record
+from haselab.base import LimitError
+from haselab.identify.physical.plausible.coarse import Glimpse, StartLaw, correlation
+from haselab.identify.physical.plausible.times import find_wrong_times, follows_with_inertia
 from haselab.identify.physical.record import MotionRecord
-from haselab.identify.physical.unknowns import Unknowns
 
 __all__ = ["find_implausible", "motion_before_drive"]
 
@@ -30,12 +30,6 @@ _STILL = 20.0  # spread of the lengths over their noise, of an actuator that mov
 _FOLLOWS = 0.7  # correlation with the simulated motion, of lengths that follow the drive
 _LITTLE = 1e-3  # of the motion, which no start explains
 _LONGEST_S = 5e3  # of a simulation for these checks: seconds of computing
-_TIME_SCALES = (1e-3, 60.0, 1e3)  # true over stated times: ms or min for s, s for ms
-# of the times, because the resonance at the start values may be off; the most likely ones first
-_TUNED = (1.0, 0.85, 1.2, 0.7, 1.4, 0.6, 1.7)
-_LONGEST_TUNED_S = 500.0
-_INERTIAS = (3.0, 20.0)  # without weight, over the hung mass
-_ALIKE, _MORE_ALIKE = 0.6, 1.4  # correlation of steps: of right times; over that of wrong ones
 _LOW = 0.3  # of the highest voltage, below which the load decides the length
 _HEAVIER = 1.1  # load over another one, whose lengths are compared
 _REVERSED = 0.25  # of the simulated difference of two lengths
@@ -48,12 +42,15 @@ _BEFORE, _SHARE_BEFORE = 5.0, 0.1  # spread before the drive changes, over noise
 _DECIDES = 0.5  # simulated difference over that at rest; above, creep does not reverse it
 
 
-def find_implausible(law: ActuatorLaw, records: Sequence[MotionRecord]) -> str:
+def find_implausible(
+    law: ActuatorLaw, records: Sequence[MotionRecord], added_inertia_kg: float = 0.0
+) -> str:
     """Say which unit, voltage, sign or mass of the records cannot be right.
 
     Args:
         law: at the start values, which may be off by a factor of 2.
         records: to be fitted.
+        added_inertia_kg: without weight, where the fit begins.
     Returns:
         What is wrong and what to do; empty if nothing is.
     """
@@ -66,14 +63,18 @@ def find_implausible(law: ActuatorLaw, records: Sequence[MotionRecord]) -> str:
                 return f"{record.name}: {fault}"
     if fault := _still(records):
         return fault
+    start = StartLaw(law, added_inertia_kg)
     beginnings = [_beginning(record) for record in records if _seen_early(record).any()]
-    lengths = [_simulated_m(law, record) for record in beginnings]
+    lengths = [_simulated_m(start, record) for record in beginnings]
     for record, length_m in zip(beginnings, lengths, strict=True):
-        for fault in (
-            _drive(law, record, length_m), _times(law, record), _sign(law, record, length_m)
-        ):  # fmt: skip
-            if fault:
-                return f"{record.name}: {fault}"
+        if fault := _drive(law, record, length_m):
+            return f"{record.name}: {fault}"
+    for record in records:
+        if fault := find_wrong_times(start, record):
+            return f"{record.name}: {fault}"
+    for record, length_m in zip(beginnings, lengths, strict=True):
+        if fault := _sign(start, record, length_m):
+            return f"{record.name}: {fault}"
     return _loads(law, beginnings, lengths)
 
 
@@ -255,7 +256,7 @@ def _drive(law: ActuatorLaw, record: MotionRecord, simulated_m: Floats | None) -
     moves = moved_m < _UNSEEN * noise_m and spread_m > _STILL * noise_m
     moves = moves and float(np.ptp(record.drive.load_n)) == 0.0  # else the load may have moved it
     if simulated_m is not None and moved_m < _LITTLE * spread_m:
-        moves = moves or _correlation(seen_m, simulated_m[usual]) > _FOLLOWS
+        moves = moves or correlation(seen_m, simulated_m[usual]) > _FOLLOWS
     if not moves:
         return ""
     return (
@@ -289,30 +290,10 @@ def _moved_m(law: ActuatorLaw, record: MotionRecord, voltage_v: float) -> float 
     return abs(at_m - rest_m)
 
 
-def _simulated_m(
-    law: ActuatorLaw, record: MotionRecord, time_scale: float = 1.0, inertia: float = 0.0
-) -> Floats | None:
-    """Lengths that the start values give; None where they describe no motion. Shape `(F,)`.
-
-    Args:
-        law: at the start values.
-        record: with what acted, and when the lengths were seen.
-        time_scale: true over stated times.
-        inertia: without weight, over the hung mass.
-    """
-    drive = record.drive
-    scaled = replace(
-        record,
-        drive=replace(drive, edge_s=time_scale * drive.edge_s),
-        length_time_s=time_scale * record.length_time_s,
-        exposure_s=time_scale * record.exposure_s,
-    )
-    mass_kg = float(drive.mass_kg.max())
-    start = Unknowns.of(law, added_inertia_kg=inertia * mass_kg, mass_kg=mass_kg)
-    try:
-        return model_record(start, scaled, derivatives=False).length_m
-    except HaselabError:
-        return None
+def _simulated_m(law: StartLaw, record: MotionRecord) -> Floats | None:
+    """Lengths that the start values give; None where they describe no motion. Shape `(F,)`."""
+    found = law.simulated(record)
+    return None if found is None else found[0]
 
 
 def _early_count(record: MotionRecord) -> int:
@@ -345,69 +326,17 @@ def _beginning(record: MotionRecord) -> MotionRecord:
     )  # fmt: skip
 
 
-def _correlation(one: Floats, other: Floats) -> float:
-    """Of two signals; 0 where one of them does not change."""
-    if one.size < _LEAST_LENGTHS or not (np.ptp(one) > 0.0 and np.ptp(other) > 0.0):
-        return 0.0
-    return float(np.corrcoef(one, other)[0, 1])
-
-
-def _times(law: ActuatorLaw, record: MotionRecord) -> str:
-    """Whether the lengths follow the drive in another unit of the times only."""
-    stated = _agreement(law, record, 1.0)
-    for scale in _TIME_SCALES if stated < _ALIKE else ():
-        other = _agreement(law, record, scale)
-        if other > max(_ALIKE, _MORE_ALIKE * stated):
-            if _follows_with_inertia(law, record):
-                return ""
-            change = f"{scale:g} times longer" if scale > 1.0 else f"{1.0 / scale:g} times shorter"
-            return (
-                "the lengths do not follow the drive as an actuator does, but they would if all "
-                f"times were {change} (correlation of the steps: {other:.2f}, now {stated:.2f}). "
-                "Check the unit of the times (s)"
-            )
-    return ""
-
-
-def _follows_with_inertia(law: ActuatorLaw, record: MotionRecord) -> bool:
-    """Whether the lengths follow the drive as those of an actuator with a large inertia do."""
-    for times in _INERTIAS:
-        simulated_m = _simulated_m(law, record, inertia=times)
-        if simulated_m is not None:
-            steps_m = np.diff(record.length_m), np.diff(simulated_m)
-            if _correlation(*steps_m) > _ALIKE:
-                return True
-    return False
-
-
-def _agreement(law: ActuatorLaw, record: MotionRecord, time_scale: float) -> float:
-    """Largest correlation of the steps from length to length with simulated ones.
-
-    Args:
-        law: at the start values, whose resonance may be off.
-        record: of the motion.
-        time_scale: true over stated times.
-    """
-    duration_s, best = time_scale * float(np.ptp(record.drive.edge_s)), 0.0
-    for tuned in _TUNED if duration_s < _LONGEST_TUNED_S else _TUNED[:1]:
-        if best > _ALIKE or duration_s > _LONGEST_S:
-            break
-        simulated_m = _simulated_m(law, record, tuned * time_scale)
-        if simulated_m is not None:
-            best = max(best, _correlation(np.diff(record.length_m), np.diff(simulated_m)))
-    return best
-
-
-def _sign(law: ActuatorLaw, record: MotionRecord, simulated_m: Floats | None) -> str:
+def _sign(law: StartLaw, record: MotionRecord, simulated_m: Floats | None) -> str:
     """Whether the lengths grow where the actuator contracts, with any inertia."""
     if simulated_m is None or float(np.ptp(record.drive.voltage_v)) == 0.0:
         return ""
     usual = _usually_loaded(record)
-    found = _correlation(record.length_m[usual], simulated_m[usual])
+    found = correlation(record.length_m[usual], simulated_m[usual])
     if found > -_FOLLOWS:
         return ""
-    if _follows_with_inertia(law, record):  # above its resonance, it moves against the drive
-        return ""
+    glimpse = Glimpse.of(record)
+    if glimpse is not None and follows_with_inertia(law, glimpse):
+        return ""  # above its resonance, it moves against the drive
     return (
         f"the lengths grow where the actuator contracts (correlation with the simulated lengths: "
         f"{found:.2f}). Give lengths that fall when the actuator contracts, not a displacement "

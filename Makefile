@@ -27,6 +27,12 @@ NATIVE  := CMakeLists.txt $(wildcard core/*.c core/include/*.h native/*/*.[ch] n
 # The tests start hundreds of processes; without its cache each would compile the package anew.
 unexport PYTHONDONTWRITEBYTECODE
 
+# The editable installation lists the modules, so it is made again after one was added, moved or removed.
+MODULES := $(shell find src/haselab -name '*.py' | LC_ALL=C sort | cksum)
+ifneq ($(MODULES),$(shell cat $(VENV)/.modules 2>/dev/null))
+  $(shell rm -f $(VENV)/.built)
+endif
+
 .PHONY: docs fuzz dist help study test check test-all setup lint ctest tools bench bench-full clean
 .DELETE_ON_ERROR:
 
@@ -142,6 +148,7 @@ $(VENV)/.built: $(NATIVE) $(VENV)/.tools
 	$(UV) -r pyproject.toml || missing=yes; wait $$compiling && { [ -z "$${missing:-}" ] || \
 	$(PIP) install --no-build-isolation --editable .; }
 	@$(BIN)/python -m compileall -q src/haselab # else each process compiles it, where no cache may be written
+	@echo '$(MODULES)' >$(VENV)/.modules
 	@touch $@
 
 # The additional packages that the tests, the checkers and the documentation need.

@@ -57,6 +57,16 @@ def test_a_right_record_has_numbers_and_no_such_note(table):
     assert not any("same effect" in note for note in fit.notes)
 
 
+def test_a_material_that_is_five_times_stiffer_is_no_wrong_mass():
+    """Its permittivity is usual; a mass stated too high would raise both."""
+    law = replace(START, shear_modulus_pa=5.0 * START.shear_modulus_pa)
+    time_s, voltage_v = acting(1200, 0.01)
+    fit = fitted((time_s, voltage_v, moved(law, MASS_KG, time_s, voltage_v)[0]))
+    assert fit.status == "ok"
+    found = fit.parameters["actuator.shear_modulus_pa"]
+    assert found.value == pytest.approx(law.shear_modulus_pa, abs=4.0 * found.std)
+
+
 @pytest.mark.parametrize("factor", [10.0, 5.0])
 def test_a_mass_that_is_far_too_high_has_no_numbers(table, factor):
     fit = fitted(table, mass=factor)

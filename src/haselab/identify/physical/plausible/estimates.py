@@ -182,8 +182,14 @@ def _absorbed(moved: list[_Moved]) -> _Absorbed | None:
         explained = (powers != 0.0) & (np.abs(off[k]) < math.sqrt(_BOUND))
         explained &= np.abs(logarithms / stds) > np.abs(off[k])
         names = tuple(one.name for one, one_of in zip(moved, explained, strict=True) if one_of)
+        # a stiffer material leaves the permittivity; a wrong mass does not, see the first lines
+        electric = any(
+            one_of and one.quantity == _PERMITTIVITY
+            for one, one_of in zip(moved, explained, strict=True)
+        )
         if (
-            len(names) >= _LEAST[cause]
+            (electric or cause != "mass")
+            and len(names) >= _LEAST[cause]
             and abs(_LOGARITHMS[k]) > math.log(_NOTED[cause])
             and before - sums[k] > _DECISIVE
             and sums[k] < _LEFT * len(moved)

@@ -159,11 +159,11 @@ def _shorter(fit: ActuatorFit) -> JsonObject:
     """One line for each parameter, linear model and law, in place of tables."""
     return {
         "determined_by": {
-            name: ", ".join(
-                f"{source.text} (without it, {source.variance_growth:.3g} times the variance)"
-                for source in sources
-            )
-            for name, sources in fit.determined_by.items()
+            "xN": "without this signal, N times the variance",
+            **{
+                name: ", ".join(f"{each.text} x{each.variance_growth:.3g}" for each in sources)
+                for name, sources in fit.determined_by.items()
+            },
         },
         "linear_models": {
             f"{point.voltage_v:g} V, {fit.mass_kg:g} kg": f"{point.gain_m_per_v:.4g} m/V, poles "

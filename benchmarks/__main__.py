@@ -35,12 +35,12 @@ SECTIONS: dict[str, tuple[Measurement, ...]] = {
             "identification.transfer", quick={"runs": 10, "structures": 0, "libraries": False}
         ),
         Measurement("control.many_loops"),
-        Measurement("identification.frequency_response", quick={"runs": 10}),
+        Measurement("identification.frequency_response", quick={"runs": 5}),
         Measurement("identification.model_comparison", quick={"count": 1, "readings": ("hz",)}),
         Measurement("identification.hysteresis", quick={"runs": 8}),
         Measurement(
             "identification.physical_model",
-            quick={"twins": 0, "starts": 2, "planted": 0, "short": 2, "bad": 1},
+            quick={"twins": 0, "starts": 2, "planted": 0, "short": 3, "bad": 1},
         ),
         Measurement("identification.prediction", quick={"twins": (), "short": 1}),
         Measurement("identification.hard_twins", quick=None),
@@ -53,7 +53,7 @@ SECTIONS: dict[str, tuple[Measurement, ...]] = {
     "campaign": (Measurement("campaign.campaign", quick={"cases": 1000}),),
     "learning": (Measurement("control.learning"),),
     "recording": (
-        Measurement("rig.recording", quick={"seconds": 20.0, "live": 10.0, "kills": 3}),
+        Measurement("rig.recording", quick={"seconds": 10.0, "live": 5.0, "kills": 3}),
         Measurement("rig.wire", quick={"seconds": 5.0}),
     ),
     "disturbances": (Measurement("sensing.disturbances", quick={"blocks": 200, "seeds": 1}),),
@@ -65,7 +65,7 @@ SECTIONS: dict[str, tuple[Measurement, ...]] = {
     ),
     "tracking": (
         Measurement("tracking.points", quick={"quick": True, "only": ("bias",)}),
-        Measurement("tracking.difficult", quick={"every": 9}),
+        Measurement("tracking.difficult", quick={"every": 12}),
     ),
     "firmware": (
         Measurement(
@@ -78,11 +78,11 @@ SECTIONS: dict[str, tuple[Measurement, ...]] = {
     "panel": (
         Measurement(
             "rig.panel",
-            quick={"presses": 50, "seconds": 5.0, "armed_presses": 10},
+            quick={"presses": 30, "seconds": 3.0, "armed_presses": 5},
             full={"seconds": 1800.0},
         ),
-        Measurement("rig.panel_chromium", quick={"presses": 50}),
-        Measurement("rig.panel_disturbance", quick={"seconds": 10.0, "rounds": 1}),
+        Measurement("rig.panel_chromium", quick={"presses": 30}),
+        Measurement("rig.panel_disturbance", quick={"seconds": 5.0, "rounds": 1}),
     ),
     "command": (Measurement("command"),),
 }

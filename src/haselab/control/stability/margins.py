@@ -213,14 +213,7 @@ def margins(
     if rate_hz is not None and not 0.0 < rate_hz < math.inf:
         raise LimitError(f"rate = {rate_hz:g} Hz; it must be above 0 Hz, or none.")
 
-    response = partial(
-        loop_response,
-        plant,
-        gains,
-        loop_delay_s=loop_delay_s,
-        rate_hz=rate_hz,
-        feedthrough=feedthrough,
-    )
+    response = _response(plant, gains, loop_delay_s, rate_hz, feedthrough)
     omega = _with_delay(frequency_grid(plant, gains, rate_hz, 6000), plant.delay_s + loop_delay_s)
     loop = response(omega)
     finite = np.isfinite(loop)  # the grid may meet a pole on the axis
@@ -256,6 +249,20 @@ def margins(
     )
 
 
+def _response(
+    plant: AnyPlant,
+    gains: PidGains | LinearController,
+    loop_delay_s: float,
+    rate_hz: float | None,
+    feedthrough: float,
+) -> Callable[[ArrayLike], NDArray[np.complex128]]:
+    """The open loop as a function of the angular frequencies."""
+    return partial(
+        loop_response, plant, gains, loop_delay_s=loop_delay_s, rate_hz=rate_hz,
+        feedthrough=feedthrough,
+    )  # fmt: skip
+
+
 def _passes_steps(plant: AnyPlant, feedthrough: float) -> bool:
     """Whether a part of the measurement jumps with the drive, so its delay is whole updates.
 
@@ -277,14 +284,7 @@ def _is_stable(
         setting = LoopSetting(rate_hz, loop_delay_s, feedthrough=feedthrough)
         poles = closed_loop_poles(plant, [gains], setting)
         return float(np.abs(poles).max()) <= 1.0 + _POLE_ERROR
-    response = partial(
-        loop_response,
-        plant,
-        gains,
-        loop_delay_s=loop_delay_s,
-        rate_hz=rate_hz,
-        feedthrough=feedthrough,
-    )
+    response = _response(plant, gains, loop_delay_s, rate_hz, feedthrough)
     omega = frequency_grid(plant, gains, rate_hz, _COARSE)
     loop = response(omega)
     good = np.isfinite(loop)

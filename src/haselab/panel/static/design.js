@@ -199,7 +199,7 @@ export default function Design({ link, state }) {
       </div>
       ${isShown && html`<div class=${`card ${isNew ? "" : "old"}`}><h2>Margins</h2>
         <${Margins} found=${found.margins} caption=${`At ${digits(found.margins.rate_hz)} Hz with a delay of ${digits(1e3 * found.margins.delay_s)} ms`} />
-        ${gains !== null && html`<div class=${same(demands?.gains ?? null, gains) ? "" : "old"}>
+        ${gains !== null && html`<div>
           ${!same(demands?.gains ?? null, gains) ? html`<p>Checking the demands …</p>` : demands.error ? html`<p class="error">${demands.error}</p>` : html`
             ${demands.shortfalls.length ? html`<p class="error">Demands not met for the worst natural frequency within frequency_spread: ${demands.shortfalls.join("; ")}.</p>` : html`<p>All demands are met.</p>`}
             <p>${demands.plausible}.</p>`}</div>`}

@@ -37,7 +37,7 @@
 
   async function stop() {
     if (socket !== null && socket.readyState === WebSocket.OPEN) socket.send("stop");
-    const other = Promise.resolve(window.stopBesides?.()).catch(() => null);
+    const other = (async () => window.stopBesides?.())().catch(() => null); // a fault in it must not keep the rest from running
     pressed = true;
     pressedAt = performance.now();
     button.classList.add("pressed");

@@ -29,7 +29,9 @@ def recorded(seed, kp, ki, count=2500):
 @pytest.mark.parametrize("seed", [0, 1, 2])
 def test_a_disturbance_that_comes_back_through_the_input_is_noted(seed):
     closed, opened = (fit_transfer(recorded(seed, kp, 2.0)) for kp in (0.5, 0.0))
-    noted = [any("residuals predict the input" in note for note in fit.notes) for fit in (closed, opened)]
+    noted = [
+        any("residuals predict the input" in note for note in fit.notes) for fit in (closed, opened)
+    ]
     assert noted == [True, False] or not closed.succeeded
     # Without a loop the same disturbance does not bias the gain.
     gain = opened.parameters["gain"]

@@ -81,7 +81,7 @@ SECTIONS: dict[str, tuple[Measurement, ...]] = {
             quick={"presses": 30, "seconds": 3.0, "armed_presses": 5},
             full={"seconds": 1800.0},
         ),
-        Measurement("rig.panel_chromium", quick={"presses": 30}),
+        Measurement("rig.panel_chromium", quick={"presses": 30, "outages_of_each": 2}),
         Measurement("rig.panel_disturbance", quick={"seconds": 5.0, "rounds": 1}),
     ),
     "command": (Measurement("command"),),

@@ -1,19 +1,24 @@
 """The panel in Chromium: its first paint, and STOP from `pointerdown` to the revoked permission.
 
-`python -m benchmarks.rig.panel_chromium [--presses 100]`
+`python -m benchmarks.rig.panel_chromium [--presses 100] [--outages 10]`
 
 The page's clock and this process's clock are the same one of the computer. The revocation is seen
 by a thread that reads the interlock's file every 0.2 ms. First, one page is open; then its scripts
 are slowed down 6 times and seven other pages receive all streams. The first paint is timed by the
 browser, from the start of the navigation to the first text or picture.
+
+For the outages, the web server is stopped by a signal for up to 8 s, and then continued; after that
+Chromium is, as when a computer sleeps. The page notes when it marks its data as old and as live.
 """
 
 import argparse
 import asyncio
 import contextlib
 import math
+import os
 import random
 import shutil
+import signal
 import subprocess
 import threading
 import time
@@ -30,7 +35,18 @@ READY = "document.getElementById('emergency-state').textContent === 'STOP: ready
 NOTE_PRESSES = """() => document.addEventListener('pointerdown',
     event => { window.pressed_ms = performance.timeOrigin + event.timeStamp; }, true)"""
 FIRST_PAINT = """() => performance.getEntriesByName('first-contentful-paint')[0].startTime"""
+NOTE_AGES = """() => {
+    window.changes = [];
+    const isOld = () => document.body.classList.contains('stale');
+    let was = isOld();
+    new MutationObserver(() => {
+        if (isOld() === was) return;
+        was = isOld();
+        window.changes.push([was, performance.timeOrigin + performance.now()]);
+    }).observe(document.body, { attributes: true, attributeFilter: ['class'] });
+}"""
 LOADS = 5
+LONGEST_S = 8.0  # of an outage
 LATEST_S = 10.0
 
 
@@ -119,11 +135,56 @@ async def pressed(
     return times_s
 
 
-def rows(presses: int = 1000) -> Iterator[Row]:
-    """Measure the first paint, then STOP on one page and on a slow one beside seven others.
+def browser_processes(parent: int) -> list[int]:
+    """Process numbers of all children of a process that are Chromium's, and of their children."""
+    words = ["ps", "-e", "-o", "pid=,ppid=,args="]
+    listed = subprocess.run(words, capture_output=True, text=True, check=True).stdout
+    found, known = [], {parent}
+    for line in sorted(listed.splitlines(), key=lambda line: int(line.split()[0])):
+        process, above, args = line.split(maxsplit=2)
+        if int(above) in known:
+            known.add(int(process))
+            if "chrom" in args:
+                found.append(int(process))
+    return found
+
+
+async def outages(
+    process: int, host: str, token: str, count: int, sleeping: bool
+) -> tuple[list[float], list[float]]:
+    """Times in s until the page marks its data as old, and until they are live after the return."""
+    old_s, live_s = [], []
+    async with chromium_page(f"http://{host}/?token={token}", 1) as found:
+        await found.wait_for_function("!document.body.classList.contains('stale')", timeout=6e4)
+        await found.evaluate(NOTE_AGES)
+        stopped = browser_processes(os.getpid()) if sleeping else [process]
+        for k in range(count):
+            await asyncio.sleep(1.0 + random.random())
+            await found.evaluate("window.changes.length = 0")
+            begun_s = time.time()
+            for one in stopped:
+                os.kill(one, signal.SIGSTOP)
+            await asyncio.sleep(1.0 + (LONGEST_S - 1.0) * k / max(count - 1, 1))
+            over_s = time.time()
+            for one in stopped:
+                os.kill(one, signal.SIGCONT)
+            await asyncio.sleep(3.0)
+            changes = [(old, 1e-3 * ms) for old, ms in await found.evaluate("window.changes")]
+            marked = [at_s - begun_s for old, at_s in changes if old]
+            old_s.append(marked[0] if marked else math.inf)
+            if changes and not changes[-1][0]:
+                live_s.append(max(changes[-1][1] - over_s, 0.0))
+            else:  # a page that slept may have got a new frame before it looked at its age
+                live_s.append(0.0 if sleeping and not changes else math.inf)
+    return old_s, live_s
+
+
+def rows(presses: int = 1000, outages_of_each: int = 20) -> Iterator[Row]:
+    """Measure the first paint, STOP on one page and on a slow one beside seven others, and outages.
 
     Args:
         presses: of STOP, for each of both.
+        outages_of_each: outages of the web server, and as many of Chromium.
     """
     if shutil.which("chromium") is None:
         return
@@ -141,10 +202,23 @@ def rows(presses: int = 1000) -> Iterator[Row]:
                   goal_ms, False, f"median {1e3 * float(np.median(seen_s)):.2g} ms")  # fmt: skip
         yield Row(f"presses of STOP in Chromium that revoked the permission, {which}",
                   len(seen_s), f"of {presses}", presses)  # fmt: skip
+    for sleeping, what in ((False, "the web server"), (True, "Chromium")):
+        with panel() as (process, host, token):
+            old_s, live_s = asyncio.run(
+                outages(process.pid, host, token, outages_of_each, sleeping)
+            )
+        if not sleeping:
+            yield Row(f"data marked as old after {what} stopped, slowest of {len(old_s)}",
+                      1e3 * max(old_s), "ms", 500.0, False)  # fmt: skip
+        yield Row(f"data live again after {what} was continued, slowest of {len(live_s)}",
+                  1e3 * max(live_s), "ms", 1000.0, False,
+                  f"median {1e3 * float(np.median(live_s)):.3g} ms")  # fmt: skip
 
 
 if __name__ == "__main__":
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--presses", type=int, default=100)
-    for row in rows(parser.parse_args().presses):
+    parser.add_argument("--outages", type=int, default=10)
+    options = parser.parse_args()
+    for row in rows(options.presses, options.outages):
         print(row, flush=True)

@@ -199,6 +199,30 @@ def test_the_loop_of_an_actuator_file_follows_the_desired_strain(actuator_file: 
         assert ended(panel) == 0
 
 
+def test_without_options_the_loop_can_be_closed_and_written_gains_are_kept(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    path = tmp_path / "out" / "twin-actuator.toml"
+
+    async def play(panel: RunningPanel) -> None:
+        async with connected(panel) as page:
+            await page.until(lambda state: state["loop"] is not None)
+            await page.arm(2.0)
+            assert "error" not in await page.ask("loop", strain=0.04)
+            await page.until(lambda state: state["mode"] == "loop" and state["drive_v"] > 1.0)
+
+    for _ in range(2):
+        panel = started()
+        try:
+            assert path.read_text().startswith(("# Findings", "# mine"))
+            asyncio.run(play(panel))
+        finally:
+            assert ended(panel) == 0
+        path.write_text(text := "# mine\n" + path.read_text().replace("ki = 11", "ki = 9"))
+    assert path.read_text() == text
+
+
 @pytest.mark.parametrize(
     "headers", [{"Origin": "http://evil.example"}, {"Host": "evil.example:80"}], ids=str
 )

@@ -153,7 +153,7 @@ class OnlyOwnPages:
                 policy = (
                     f"default-src 'self'; connect-src 'self' {self._sources()}; "
                     "img-src 'self' blob: data:; style-src 'self' 'unsafe-inline'; "
-                    "frame-ancestors 'none'"
+                    "frame-src blob:; frame-ancestors 'none'"
                 )
                 message["headers"] += [
                     (b"content-security-policy", policy.encode()),

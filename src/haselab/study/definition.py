@@ -37,6 +37,7 @@ __all__ = [
     "load_study",
     "quick_note",
     "recorded_study",
+    "reference_actuator",
     "step_study_of",
 ]
 
@@ -351,6 +352,14 @@ def builtin_table(name: str, kind: type[Table]) -> Table:
     """
     path = _STUDIES / f"{name}.toml"
     return validated(kind, read_toml(path, "study"), path)
+
+
+def reference_actuator() -> str:
+    """The actuator file that the quick reference study wrote on the twin, without physical model.
+
+    It was written by `haselab reproduce --quick --no-physical-model`.
+    """
+    return (_STUDIES / f"{REFERENCE_STUDY}-actuator.toml").read_text(encoding="utf-8")
 
 
 def builtin_study(*, quick: bool = False) -> Study:

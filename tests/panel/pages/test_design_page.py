@@ -180,11 +180,16 @@ def test_axe_finds_nothing_on_a_tablet(
 
 
 def test_without_an_actuator_file_the_page_says_how_to_start(
-    browser: Browser, shared_panel: RunningPanel
+    browser: Browser, tmp_path: Path
 ) -> None:
-    with browser.new_context() as context:
-        page = context.new_page()
-        page.goto(shared_panel.address)
-        page.get_by_role("button", name="Design").click()
-        said = page.get_by_text("Start it with: haselab panel --actuator ACTUATOR.toml").first
-        expect(said).to_be_visible(timeout=WAIT_MS)
+    (tmp_path / "rig.toml").write_text('kind = "twin"\n')
+    panel = started("--rig", str(tmp_path / "rig.toml"))
+    try:
+        with browser.new_context() as context:
+            page = context.new_page()
+            page.goto(panel.address)
+            page.get_by_role("button", name="Design").click()
+            said = page.get_by_text("Start it with --actuator ACTUATOR.toml").first
+            expect(said).to_be_visible(timeout=WAIT_MS)
+    finally:
+        ended(panel)

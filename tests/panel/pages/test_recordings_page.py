@@ -105,3 +105,53 @@ def test_a_hundred_recordings_are_drawn_at_once_and_only_when_they_change(
     expect(rows).to_have_count(200, timeout=WAIT_MS)
     page.get_by_label("Search").fill("r000")
     expect(rows).to_have_count(1, timeout=WAIT_MS)
+
+
+def test_a_note_has_a_button_until_it_is_saved(page: Page, tmp_path: Path) -> None:
+    page.get_by_label("Note about a").fill("mine")
+    save = page.get_by_role("button", name="Save", exact=True)
+    save.click()
+    expect(save).to_have_count(0, timeout=WAIT_MS)
+    page.reload()
+    expect(page.get_by_label("Note about a")).to_have_value("mine", timeout=WAIT_MS)
+    assert (tmp_path / "a" / "notes.txt").read_text() == "mine"
+
+
+def test_a_report_is_shown_in_the_page_with_stop_and_runs_no_script(
+    page: Page, tmp_path: Path
+) -> None:
+    (tmp_path / "a" / "report.html").write_text(
+        "<script>parent.wrong = 1</script><h1 onclick='parent.wrong = 1'>Results of a</h1>"
+        "<a href='#end'>to the end</a><p id='end'>The end</p>"
+    )
+    page.get_by_role("button", name="Report").click()
+    heading = page.frame_locator("iframe").get_by_role("heading", name="Results of a")
+    heading.click()
+    page.frame_locator("iframe").get_by_role("link").click()
+    expect(heading).to_be_visible()  # the link leads to a place in the report
+    assert page.evaluate("window.wrong") is None
+    state = page.locator("#emergency-state")
+    expect(state).to_have_text("STOP: ready", timeout=WAIT_MS)
+    page.keyboard.press("Escape")  # the focus is in the report
+    expect(state).to_contain_text("STOP: 0 V commanded at", timeout=WAIT_MS)
+    page.get_by_role("button", name="Close the report").click()
+    expect(page.locator("iframe")).to_have_count(0)
+
+
+def test_back_forward_and_reload_stay_on_the_page_that_was_open(page: Page) -> None:
+    def shown(name: str) -> None:
+        button = page.locator("nav [aria-current=page]")
+        expect(button).to_have_text(name, timeout=WAIT_MS)
+
+    page.get_by_role("button", name="Doctor").click()
+    shown("Doctor")
+    page.go_back()
+    shown("Studies")
+    expect(page.get_by_label("Note about a")).to_be_visible(timeout=WAIT_MS)
+    page.go_forward()
+    shown("Doctor")
+    page.reload()
+    shown("Doctor")
+    expect(page.locator("#age")).to_have_text("data live", timeout=WAIT_MS)
+    page.evaluate("location.hash = 'constructor'")  # no such page
+    shown("Live")

@@ -20,10 +20,12 @@ from haselab.cli.run_path import ACTUATOR_FILE
 from haselab.panel.files import PanelFiles
 from haselab.panel.page_server import serve
 from haselab.panel.processes import Panel, running_panel, stop_answers
-from haselab.store.folder import write_new
+from haselab.store.folder import write_new, write_text
+from haselab.study.definition import reference_actuator
 
 __all__ = ["command"]
 
+_ACTUATOR = "twin-actuator.toml"  # in the folder of --runs
 _STOP_S, _STOP_TRIALS = 4.0, 3  # if STOP answers none of these trials, the panel ends at 0 V
 
 
@@ -56,7 +58,8 @@ def _check_lan(context: click.Context, option: click.Parameter, value: str) -> s
 @shared_option(
     "--actuator", type=ACTUATOR_FILE,
     detail="With both maps and a controller, the panel can close the loop. With a model, its page "
-    "Design changes the gains. Default: none.",
+    "Design changes the gains. Default: none; without --rig, the file twin-actuator.toml in DIR of "
+    "--runs, which is written there if it is missing.",
 )  # fmt: skip
 @click.option(
     "--runs", type=click.Path(path_type=Path, file_okay=False), default=Path("out"),
@@ -96,6 +99,8 @@ def command(
             folder = Path(opened.enter_context(tempfile.TemporaryDirectory()))
             rig = folder / "twin.toml"
             write_new(rig, 'kind = "twin"\n')
+            if actuator is None:
+                actuator = _twin_actuator(runs)
         panel = opened.enter_context(
             running_panel(PanelFiles(rig, actuator, runs), page_port, lease_s, lan)
         )
@@ -108,6 +113,19 @@ def command(
         if not no_browser:
             webbrowser.open(panel.addresses[0])
         _serve(panel)
+
+
+def _twin_actuator(runs: Path) -> Path:
+    """The actuator file for the twin of the reference study; gains written to it are kept.
+
+    Raises:
+        DeviceError: it cannot be written.
+    """
+    path = runs / _ACTUATOR
+    if not path.exists():
+        write_text(path, reference_actuator())
+    click.echo(f"haselab: Maps, model and controller are those of {path}.", err=True)
+    return path
 
 
 def _serve(panel: Panel) -> None:

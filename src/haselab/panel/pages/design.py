@@ -63,7 +63,7 @@ _LONGEST_S = 30.0
 _MOST_SAMPLES = 4000
 _LEAST, _MOST = 1e-12, 1e12  # gains
 _NO_FILE = (
-    "The panel was started without an actuator file. Start it with: haselab panel --actuator "
+    "The panel was started with --rig, but without an actuator file. Start it with --actuator "
     "ACTUATOR.toml. A study with [triangle], [chirp] and [steps] writes such a file, "
     "actuator.toml, into the folder of its recording. For a file from example records, run: "
     "haselab example actuator --out example"

@@ -8,12 +8,12 @@ export const resolved = (name) => { // light-dark() is resolved by the browser, 
   return found;
 };
 
-const HEIGHT = 140;
+const HEIGHT = 130;
 const PLOTS = [
   { title: "Voltage", unit: "kV", of: "monitors", lines: [{ name: "voltage", channel: 0, scale: 1e-3 }] },
-  { title: "Current", unit: "mA", of: "monitors", lines: [{ name: "current", channel: 1, scale: 1e3 }] },
-  { title: "Capacitance", unit: "pF", of: "signals", lines: [{ name: "capacitance", channel: 2, scale: 1e12 }] },
   { title: "Strain", unit: "%", of: "signals", lines: [{ name: "sensed", channel: 3, scale: 100 }, { name: "desired", channel: 1, scale: 100 }] },
+  { title: "Capacitance", unit: "pF", of: "signals", lines: [{ name: "capacitance", channel: 2, scale: 1e12 }] },
+  { title: "Current", unit: "mA", of: "monitors", lines: [{ name: "current", channel: 1, scale: 1e3 }] },
   { title: "Drive", unit: "V", of: "signals", lines: [{ name: "drive", channel: 0, scale: 1 }, { name: "monitor minus drive", channel: 4, scale: 1 }] },
 ];
 
@@ -62,7 +62,7 @@ export class Charts {
     const plot = new uPlot({
       width: Math.max(card.clientWidth - 24, 200), height: HEIGHT, series, bands, legend: { show: false },
       scales: { x: { time: false } },
-      axes: [{ ...axis, values: seconds }, { ...axis, size: 70, label: about.unit, labelSize: 20 }],
+      axes: [{ ...axis, size: 32, values: seconds }, { ...axis, size: 70, space: 20, label: about.unit, labelSize: 20 }],
       cursor: { sync: { key: "haselab" }, drag: { x: true, y: false, setScale: false } },
       hooks: {
         draw: [(u) => this.mark(u, text)],

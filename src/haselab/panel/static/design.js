@@ -183,7 +183,7 @@ export default function Design({ link, state }) {
     <section class="plots" aria-label="Responses">
       ${about.warnings.map((text) => html`<p class="error">${text}</p>`)}
       ${found?.error && html`<p class="error" role="alert">${found.error}</p>`}
-      ${isShown && html`<div class=${isNew ? "" : "old"}><${Plots} found=${found} output=${about.output} unit=${about.unit} /></div>`}
+      ${isShown && html`<div class=${isNew ? "all" : "all old"}><${Plots} found=${found} output=${about.output} unit=${about.unit} /></div>`}
     </section>
     <section class="controls" aria-label="Controller">
       <div class="card"><h2>Gains</h2>

@@ -62,8 +62,10 @@
   });
   // Voice control, screen readers and switch devices send only a click.
   button.addEventListener("click", () => { if (performance.now() - pressedAt > 1000) stop(); });
-  document.addEventListener("keydown", (event) => {
+  // Also for a document in a frame of this page, whose keys do not arrive here.
+  window.listenForStop = (place) => place.addEventListener("keydown", (event) => {
     if (event.key === "Escape" && !event.repeat) stop();
   }, true);
+  window.listenForStop(document);
   ready();
 })();

@@ -130,6 +130,9 @@ const TABS = {
   Live: "", Studies: "/static/studies.js", Pick: "/static/pick.js", Design: "/static/design.js", Doctor: "/static/doctor.js",
 };
 
+// The page is named in the address, so that Back, Forward and Reload show the right one.
+const named = () => { const name = location.hash.slice(1); return Object.hasOwn(TABS, name) ? name : "Live"; };
+
 function Lazy({ from, ...rest }) {
   const [found, find] = useState({ part: null, error: "" });
   useEffect(() => {
@@ -140,11 +143,13 @@ function Lazy({ from, ...rest }) {
 }
 
 function Panel() {
-  const [tab, open] = useState("Live");
+  const [tab, show] = useState(named());
+  const open = (name) => { location.hash = name; };
   const [, force] = useReducer((n) => n + 1, 0);
   const [error, say] = useState("");
   useEffect(() => {
     redraw = force;
+    addEventListener("hashchange", () => show(named()));
     charts = new Charts(document.getElementById("charts"), zoom, (columns) => {
       if (columns !== link.view.columns) link.setView({ columns });
     });

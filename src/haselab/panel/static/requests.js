@@ -3,7 +3,7 @@ export class Requests {
   constructor() {
     this.token = new URLSearchParams(location.search).get("token") || sessionStorage.getItem("token") || "";
     sessionStorage.setItem("token", this.token);
-    history.replaceState(null, "", location.pathname); // the token does not stay in the address
+    history.replaceState(null, "", location.pathname + location.hash); // the token does not stay in the address
   }
 
   async request(name, values = {}) {

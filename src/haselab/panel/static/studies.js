@@ -1,5 +1,5 @@
 // Choose, check and play a study; the list of recordings.
-import { html, useState, useEffect, useMemo } from "/static/vendor/htm-preact.js";
+import { html, useState, useEffect, useMemo, useRef } from "/static/vendor/htm-preact.js";
 import { Arming, Playing, Progress, Said, fixed, kilo, limitOf } from "/static/bench.js";
 
 const number = (v) => (v === null || v === undefined ? "" : Number(v.toPrecision(5)));
@@ -92,11 +92,24 @@ function Note({ name, saved, keep }) {
     if (drafts.get(name)?.text === sent) change(null); // nobody typed meanwhile
     else change({ ...drafts.get(name), before: sent });
   }
+  const isTyped = draft !== null && !differs && draft.text !== saved;
   return html`<textarea aria-label=${`Note about ${name}`} rows="2" value=${draft === null ? saved : draft.text} onInput=${(e) => type(e.target.value)}
       onBlur=${() => draft !== null && !differs && save(saved)}></textarea>
+    ${isTyped && html`<button type="button" onClick=${() => save(saved)}>Save</button>`}
     ${differs && html`<p class="error" role="alert">Not saved: meanwhile, the note was changed to “${saved}”.</p>
       <div class="row"><button type="button" onClick=${() => save(saved)}>Save what I typed instead</button>
         <button type="button" onClick=${() => change(null)}>Discard what I typed</button></div>`}`;
+}
+
+// A report, in this page, so that STOP stays in view; it has no scripts, and none would run.
+function Report({ name, text, close }) {
+  const place = useRef(null);
+  const address = useMemo(() => URL.createObjectURL(new Blob([text], { type: "text/html" })), []);
+  useEffect(() => { place.current.scrollIntoView(); place.current.focus({ preventScroll: true }); return () => URL.revokeObjectURL(address); }, []);
+  return html`<div class="card report"><h2 ref=${place} tabindex="-1">Report of ${name}</h2>
+    <div class="row"><button type="button" onClick=${close}>Close the report</button>
+      <span>For a tab of its own, open report.html in the folder of the recording.</span></div>
+    <iframe title=${`Report of ${name}`} sandbox="allow-same-origin" src=${address} onLoad=${(e) => window.listenForStop(e.target.contentDocument)}></iframe></div>`;
 }
 
 const MOST_ROWS = 100; // more are drawn on request: thousands would block the page, and the bench would be lost
@@ -116,12 +129,11 @@ function Recordings({ link, mode, recording }) {
     return () => { over = true; clearTimeout(timer); };
   }, []);
   useEffect(() => { if (mode !== undefined) read(); }, [mode]);
+  const [shown, show] = useState(null);
   async function open(name) {
-    const page = window.open("", "_blank"); // at once: a later one would be blocked as a pop-up
     const answer = await link.request("report", { name });
     say(answer.error || "");
-    if (answer.error) { page?.close(); return; }
-    page.location = URL.createObjectURL(new Blob([answer.html], { type: "text/html" }));
+    show(answer.error ? null : { name, text: answer.html });
   }
   async function analyse(name) {
     const answer = await link.request("analyse", { name });
@@ -140,7 +152,8 @@ function Recordings({ link, mode, recording }) {
     return wanted.every((word) => text.includes(word));
   });
   const toggle = (name, on) => mark(on ? [...marked, name].slice(-2) : marked.filter((one) => one !== name));
-  return html`${compared && html`<${Comparison} link=${link} names=${compared} close=${() => setCompared(null)} />`}
+  return html`${shown && html`<${Report} key=${shown.name} name=${shown.name} text=${shown.text} close=${() => show(null)} />`}
+    ${compared && html`<${Comparison} link=${link} names=${compared} close=${() => setCompared(null)} />`}
     <div class="card"><h2>Recordings</h2>
     ${error && html`<p class="error" role="alert">${error}</p>`}
     <p>${found.recordings.length} in ${found.folder}</p>

@@ -45,7 +45,7 @@ def test_its_maps_are_those_of_another_seed(played):
         strain = at_m / one["actuator"]["geometry"]["zero_length_m"] - 1.0
         drives.append(curve["a1_v"] * np.exp(curve["b1"] * strain)
                       + curve["a2_v"] * np.exp(curve["b2"] * strain))  # fmt: skip
-    assert 0.0 < np.min(drives) and np.max(drives) < 2.1
+    assert np.min(drives) > 0.0 and np.max(drives) < 2.1
     # The noise moves such a fit by some 0.1 mV; 5 mV are a quarter of a per cent of the range.
     assert np.max(np.abs(drives[0] - drives[1])) < 0.005
 

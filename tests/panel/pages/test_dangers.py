@@ -53,7 +53,7 @@ def test_a_finger_moves_a_slider_only_by_its_handle(browser: Browser, panel: Run
     with opened(browser, panel.address, viewport=PHONE, has_touch=True, is_mobile=True) as page:
         arm(page)
         touch = page.context.new_cdp_session(page)
-        slider = page.get_by_role("slider", name="Drive")
+        slider = page.get_by_role("slider", name=re.compile("^Drive"))
 
         def middle() -> tuple[float, float, float]:
             slider.scroll_into_view_if_needed()
@@ -122,7 +122,7 @@ def test_the_state_of_a_bench_without_new_data_is_called_unknown(
             )
             for name in ("Disarm", "Ramp to 0 V"):
                 expect(page.get_by_role("button", name=name)).to_be_disabled(timeout=WAIT_MS)
-            expect(page.get_by_role("slider", name="Drive")).to_be_disabled()
+            expect(page.get_by_role("slider", name=re.compile("^Drive"))).to_be_disabled()
             expect(page.get_by_text("What is shown of the bench is old")).to_be_visible()
         finally:
             os.kill(panel.process.pid, signal.SIGCONT)

@@ -95,7 +95,7 @@ def test_the_page_has_every_section_with_intervals_bands_and_provenance(
     text = re.sub(r"<svg.*?</svg>|<[^>]+>", " ", page, flags=re.DOTALL)
     text = re.sub(r"\s+", " ", text)
     assert "<title>left leg</title>" in page and page.count("<svg") == 3
-    assert "peano-hasel" in text and "haselab calibrate" in text
+    assert "peano-hasel" in text and "calibrate in Python, see docs/measure/sensing.md" in text
     half = 1.959964 * 1e-2
     low, high = 28.0 * np.exp(-half), 28.0 * np.exp(half)
     assert re.search(rf"natural_frequency_rad_s\s+28.00\s+\[{low:.2f}, {high:.2f}\]", text)

@@ -41,7 +41,7 @@ _TITLES = {
 }
 _KEY = {"sensing": "sensing.scale_s"}  # key that a section lacks; the others are whole tables
 _COMMANDS = {
-    "sensing.scale_s": "haselab calibrate … --actuator A.toml (only a real bench needs it)",
+    "sensing.scale_s": "calibrate in Python, see docs/measure/sensing.md (not for the twin)",
     "sensing.strain_map": "haselab identify capacitance-map FILE --actuator A.toml",
     "drive.voltage_map": "haselab identify voltage-map FILE --actuator A.toml",
     "model": "haselab identify transfer FILE --actuator A.toml",

@@ -1,16 +1,15 @@
 """`haselab calibrate`: the procedure on the twin, the file, and every way out at 0 V."""
 
 import json
+from collections.abc import Iterator
 from pathlib import Path
 
-import click
 import pytest
 
 from haselab.base import DeviceError, InputError
 from haselab.cli import main as entry
 from haselab.cli.bench import calibrate
 from haselab.pipelines.calibration_file import load_calibration, save_calibration
-from haselab.rig import Rig
 from haselab.rig.twin.config import TwinConfig
 from haselab.rig.twin.twin_bench import TwinBench, rig_of
 
@@ -97,9 +96,7 @@ def test_what_cannot_be_is_refused_in_one_line(arguments, code, words, capsys):
 
 
 def test_swapped_references_are_refused(rig_file, monkeypatch, capsys):
-    bench, _ = bench_without_fixture(monkeypatch)
-    values = iter([2.2e-9, 0.47e-9, None])
-    monkeypatch.setattr(click, "confirm", lambda *a, **k: bench.connect(next(values)))
+    bench_that_connects(monkeypatch, 2.2e-9, 0.47e-9, None)
     assert run(["--rig", "twin", "--capacitor", "0.47e-9", "--capacitor", "2.2e-9"]) == 3
     assert "phase error of -178 deg" in capsys.readouterr().err
 
@@ -111,40 +108,33 @@ def test_a_rig_file_that_is_not_there_is_refused(tmp_path, capsys):
 
 
 def test_a_reference_that_is_another_one_is_refused(monkeypatch, capsys):
-    bench, _ = bench_without_fixture(monkeypatch)
-    values = iter([0.47e-9, 22e-9, None])
-    monkeypatch.setattr(click, "confirm", lambda *a, **k: bench.connect(next(values)))
+    bench_that_connects(monkeypatch, 0.47e-9, 22e-9, None)
     assert run(["--rig", "twin", "--capacitor", "0.47e-9", "--capacitor", "2.2e-9"]) == 3
     assert "times their nominal gain" in capsys.readouterr().err
 
 
-def bench_without_fixture(monkeypatch: pytest.MonkeyPatch) -> tuple[TwinBench, Rig]:
+class Mistaken:
+    """A fixture that connects other capacitors than it was asked for."""
+
+    def __init__(self, bench: TwinBench, values: Iterator[float | None]) -> None:
+        self.bench, self.values = bench, values
+
+    def connect(self, capacitance_f: float | None, series_ohm: float = 0.0) -> None:
+        self.bench.connect(next(self.values), series_ohm)
+
+
+def bench_that_connects(monkeypatch: pytest.MonkeyPatch, *values: float | None) -> TwinBench:
     bench = TwinBench(TwinConfig(), 1)
     rig = rig_of(bench, TwinConfig())
-    rig.fixture = None
+    if values:
+        rig.fixture = Mistaken(bench, iter(values))
     monkeypatch.setattr(calibrate, "_rig_of", lambda name: rig)
-    return bench, rig
-
-
-def test_the_operator_confirms_while_the_output_is_off(monkeypatch, capsys):
-    bench, _ = bench_without_fixture(monkeypatch)
-    values = iter([0.47e-9, 2.2e-9, None])
-    # `connect` of the twin refuses while there is a drive or a carrier.
-    monkeypatch.setattr(click, "confirm", lambda *a, **k: bench.connect(next(values)))
-    assert run(["--rig", "twin", *TWO, "--json"]) == 0
-    captured = capsys.readouterr()
-    json.loads(captured.out)
-    asked = captured.err.splitlines()
-    assert all("measure. Then connect " in line for line in asked)
-    assert [line.split("connect ")[1].split(", remove")[0] for line in asked] == [
-        "0.47 nF", "2.2 nF in series with 5 ohm", "the actuator"
-    ]  # fmt: skip
+    return bench
 
 
 @pytest.mark.parametrize("failure", [DeviceError("gone"), KeyboardInterrupt()])
 def test_every_way_out_ends_at_0_v_without_a_carrier(failure, monkeypatch, capsys):
-    bench, rig = bench_without_fixture(monkeypatch)
-    rig.fixture = bench
+    bench = bench_that_connects(monkeypatch)
     blocks = iter(range(20))
     read = bench.read
 

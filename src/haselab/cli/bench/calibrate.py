@@ -51,22 +51,6 @@ class _Request:
     duration_s: float
 
 
-class _OperatorFixture:
-    """A fixture whose capacitors a person exchanges."""
-
-    def connect(self, capacitance_f: float | None, series_ohm: float = 0.0) -> None:
-        """See `haselab.rig.ReferenceFixture`."""
-        what = "the actuator" if capacitance_f is None else f"{1e9 * capacitance_f:g} nF"
-        series = f" in series with {series_ohm:g} ohm" if series_ohm else ""
-        click.echo(
-            "The drive and the carrier were commanded off. Charge may remain: switch the amplifier "
-            f"off, short the electrodes and measure. Then connect {what}{series}, remove the short "
-            "and switch the amplifier on.",
-            err=True,
-        )
-        click.confirm("Connected?", default=True, abort=True, err=True)
-
-
 def _references(
     context: click.Context, parameter: click.Parameter, values: tuple[str, ...]
 ) -> tuple[Reference, ...]:
@@ -281,9 +265,8 @@ def command(
             "differ. Add another one."
         )
     bench = _rig_of(rig)
-    readings = _measure(
-        bench, bench.fixture or _OperatorFixture(), request, Interruptible(progress_bar())
-    )
+    assert bench.fixture is not None  # a simulated one has it
+    readings = _measure(bench, bench.fixture, request, Interruptible(progress_bar()))
     d = bench.description
     calibration = fit_calibration(
         request.references,

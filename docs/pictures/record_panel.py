@@ -8,7 +8,6 @@ Needs Chromium, and `pip install haselab playwright`. The bench is the twin: all
 from __future__ import annotations
 
 import io
-import shlex
 import shutil
 import signal
 import subprocess
@@ -23,7 +22,6 @@ import numpy as np
 from PIL import Image
 from playwright.sync_api import Page, expect, sync_playwright
 
-from haselab.pipelines.examples.data_sets import find_data_set, write_data_set
 from haselab.rig.twin.camera import TwinCamera, TwinCameraConfig
 from haselab.store.video.writer import VideoWriter
 
@@ -73,13 +71,7 @@ class Film:
 
 
 def prepared(folder: Path) -> None:
-    """Write actuator.toml, and a video below runs."""
-    example = find_data_set("actuator")
-    write_data_set(example, folder)
-    for command in example.commands:
-        subprocess.run(
-            [*HASELAB, *shlex.split(command)], cwd=folder, check=True, capture_output=True
-        )
+    """Write a video below runs."""
     (folder / "runs" / "run1").mkdir(parents=True)
     camera = TwinCamera(TwinCameraConfig(), half_width_m=0.06, free_length_m=0.05, seed=4)
     strain = np.concatenate([np.zeros(5), np.linspace(0.0, 0.05, 11)])
@@ -92,10 +84,7 @@ def prepared(folder: Path) -> None:
 @contextmanager
 def panel(folder: Path) -> Iterator[str]:
     """`haselab panel` on the twin; the address of its page."""
-    command = [
-        *HASELAB, "panel", "--no-browser", "--actuator", "actuator.toml", "--runs", "runs",
-        "--lease-s", "10",
-    ]  # fmt: skip
+    command = [*HASELAB, "panel", "--no-browser", "--runs", "runs", "--lease-s", "10"]
     process = subprocess.Popen(command, cwd=folder, stdout=subprocess.PIPE, text=True)
     assert process.stdout is not None
     try:

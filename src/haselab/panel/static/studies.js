@@ -109,7 +109,7 @@ function Report({ name, text, close }) {
   return html`<div class="card report"><h2 ref=${place} tabindex="-1">Report of ${name}</h2>
     <div class="row"><button type="button" onClick=${close}>Close the report</button>
       <span>For a tab of its own, open report.html in the folder of the recording.</span></div>
-    <iframe title=${`Report of ${name}`} sandbox="allow-same-origin" src=${address} onLoad=${(e) => window.listenForStop(e.target.contentDocument)}></iframe></div>`;
+    <iframe title=${`Report of ${name}`} sandbox="allow-same-origin" src=${address} onLoad=${(e) => { if (e.target.contentDocument) window.listenForStop(e.target.contentDocument); }}></iframe></div>`;
 }
 
 const MOST_ROWS = 100; // more are drawn on request: thousands would block the page, and the bench would be lost

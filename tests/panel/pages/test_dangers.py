@@ -170,3 +170,41 @@ def test_the_terminal_says_at_the_end_that_0_v_was_commanded(capfd: pytest.Captu
     panel = started()
     ended(panel)
     assert "The panel has ended, and 0 V was commanded." in capfd.readouterr().err
+
+
+def test_state_and_old_data_stay_beside_stop_when_the_page_is_scrolled(
+    browser: Browser, panel: RunningPanel
+) -> None:
+    with opened(browser, panel.address, viewport={"width": 1280, "height": 500}) as page:
+        arm(page)
+        drive(page, "1")
+        corner = page.locator("#corner-state")
+        page.get_by_role("heading", name="Camera").scroll_into_view_if_needed()
+        expect(corner).to_contain_text("Bench: running, 1.000 V", timeout=WAIT_MS)
+        expect(corner).to_be_in_viewport()
+        page.context.set_offline(True)
+        os.kill(panel.process.pid, signal.SIGSTOP)
+        try:
+            page.keyboard.press("Escape")
+            expect(corner).to_contain_text("NO NEW DATA", timeout=WAIT_MS)
+            said = page.locator("#emergency-state")
+            expect(said).to_contain_text("Press the emergency stop", timeout=WAIT_MS)
+            above, below = said.bounding_box(), corner.bounding_box()
+            assert above is not None and below is not None
+            assert above["y"] + above["height"] <= below["y"]  # it does not cover the instruction
+        finally:
+            os.kill(panel.process.pid, signal.SIGCONT)
+
+
+def test_no_list_can_take_the_key_of_stop_while_the_bench_is_armed(
+    browser: Browser, panel: RunningPanel
+) -> None:
+    with opened(browser, panel.address) as page:
+        page.get_by_role("button", name="Studies").click()
+        study = page.get_by_role("combobox", name="Study")
+        expect(study).to_be_enabled(timeout=WAIT_MS)
+        page.get_by_role("button", name="Live", exact=True).click()
+        arm(page)
+        for name, label in (("Studies", "Study"), ("Pick", "Video")):
+            page.get_by_role("button", name=name).click()
+            expect(page.get_by_role("combobox", name=label)).to_be_disabled(timeout=WAIT_MS)

@@ -217,7 +217,8 @@ def test_computed_and_written_gains_give_the_section_of_haselab_design(
 def test_writing_keeps_comments_and_all_else_and_states_its_origin(path: Path) -> None:
     before = path.read_text()
     sha256 = ask(path, "design-loop", **GAINS)["sha256"]
-    assert ask(path, "design-write", **GAINS, sha256=sha256) == {"written": str(path)}
+    written = ask(path, "design-write", **GAINS, sha256=sha256)
+    assert written == {"written": str(path), "sha256": ask(path, "design")["sha256"]}
     text = path.read_text()
     assert text.startswith(MODEL)
     held = tomllib.loads(text)

@@ -193,3 +193,27 @@ def test_without_an_actuator_file_the_page_says_how_to_start(
             expect(said).to_be_visible(timeout=WAIT_MS)
     finally:
         ended(panel)
+
+
+def test_gains_that_another_program_wrote_are_not_reverted(page: Page, path: Path) -> None:
+    path.write_text(path.read_text().replace("ki = ", "ki = 0.1 # "))
+    typed(page, "Derivative gain").fill("0.011")
+    page.keyboard.press("Enter")
+    said = page.get_by_text("The file has changed since this page read it.")
+    expect(said).to_be_visible(timeout=WAIT_MS)
+    page.get_by_role("button", name="Write to the actuator file").click()
+    expect(page.get_by_text("Not written: the actuator file has changed")).to_be_visible(
+        timeout=WAIT_MS
+    )
+    assert tomllib.loads(path.read_text())["controller"]["parameters"]["ki"] == 0.1
+    page.get_by_role("button", name="Read the file again").click()
+    expect(typed(page, "Integral gain")).to_have_value("0.1", timeout=WAIT_MS)
+    page.get_by_role("button", name="Write to the actuator file").click()
+    expect(page.get_by_text(re.compile("^Written to"))).to_be_visible(timeout=WAIT_MS)
+
+
+def test_the_step_is_shown_until_a_slow_loop_settles(path: Path) -> None:
+    for ki, longest_s in ((2.0, 10.0), (0.3, 30.0)):
+        step = ask(path, "design-loop", **{**GAINS, "kp": 0.0, "kd": 0.0, "ki": ki})["step"]
+        late = abs(step["measured"][-1] - step["reference"][-1])
+        assert late < 0.05 * abs(step["reference"][-1]) and step["time_s"][-1] <= longest_s

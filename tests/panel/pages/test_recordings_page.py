@@ -108,10 +108,14 @@ def test_a_hundred_recordings_are_drawn_at_once_and_only_when_they_change(
 
 
 def test_a_note_has_a_button_until_it_is_saved(page: Page, tmp_path: Path) -> None:
+    sent = []
+    page.on("request", lambda request: sent.append(request.url.rpartition("/")[2]))
     page.get_by_label("Note about a").fill("mine")
     save = page.get_by_role("button", name="Save", exact=True)
     save.click()
+    expect(page.get_by_text("Saved.")).to_be_visible(timeout=WAIT_MS)
     expect(save).to_have_count(0, timeout=WAIT_MS)
+    assert sent.count("note") == 1  # the field saves, too, when the button takes the focus
     page.reload()
     expect(page.get_by_label("Note about a")).to_have_value("mine", timeout=WAIT_MS)
     assert (tmp_path / "a" / "notes.txt").read_text() == "mine"
@@ -135,6 +139,32 @@ def test_a_report_is_shown_in_the_page_with_stop_and_runs_no_script(
     page.keyboard.press("Escape")  # the focus is in the report
     expect(state).to_contain_text("STOP: 0 V commanded at", timeout=WAIT_MS)
     page.get_by_role("button", name="Close the report").click()
+    expect(page.locator("iframe")).to_have_count(0)
+
+
+def test_a_report_that_leads_elsewhere_gives_the_keys_back(page: Page, tmp_path: Path) -> None:
+    (tmp_path / "a" / "report.html").write_text(
+        "<h1>Results of a</h1><select><option>b</option></select><iframe srcdoc='c'></iframe>"
+        "<a href='http://127.0.0.1:9/'>to another page</a>"
+    )
+    for _ in range(2):  # it can be opened again
+        page.get_by_role("button", name="Report").click()
+        report = page.frame_locator("iframe")
+        expect(report.get_by_role("heading", name="Results of a")).to_be_visible(timeout=WAIT_MS)
+        expect(report.locator("iframe, select")).to_have_count(0)  # they would take the keys
+        report.get_by_role("link").click()
+        expect(page.get_by_text("A link in the report led elsewhere")).to_be_visible(
+            timeout=WAIT_MS
+        )
+    page.keyboard.press("Escape")
+    state = page.locator("#emergency-state")
+    expect(state).to_contain_text("STOP: 0 V commanded at", timeout=WAIT_MS)
+
+
+def test_a_report_that_would_keep_stop_waiting_is_not_shown(page: Page, tmp_path: Path) -> None:
+    (tmp_path / "a" / "report.html").write_text("<p>" + 11_000_000 * "a")
+    page.get_by_role("button", name="Report").click()
+    expect(page.get_by_text("at most 10 MB")).to_be_visible(timeout=WAIT_MS)
     expect(page.locator("iframe")).to_have_count(0)
 
 

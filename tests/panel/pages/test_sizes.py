@@ -93,7 +93,7 @@ def test_every_page_fits_also_after_it_was_turned(
             page.get_by_role("button", name="Disarm").click()
             page.get_by_role("button", name="Studies").click()
             expect(page.get_by_label(f"Mark {LONG}-1")).to_be_visible(timeout=WAIT_MS)
-            page.get_by_role("button", name="Check", exact=True).click()
+            page.get_by_role("button", name="Check, then play").click()
             expect(page.get_by_text("The bench can play this study")).to_be_visible(timeout=WAIT_MS)
             for number in (1, 2):
                 page.get_by_label(f"Mark {LONG}-{number}").check()

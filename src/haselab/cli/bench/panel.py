@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import contextlib
 import ipaddress
+import os
 import subprocess
 import tempfile
 import threading
@@ -122,9 +123,12 @@ def _twin_actuator(runs: Path) -> Path:
         DeviceError: it cannot be written.
     """
     path = runs / _ACTUATOR
-    if not path.exists():
-        write_text(path, reference_actuator())
-    click.echo(f"haselab: Maps, model and controller are those of {path}.", err=True)
+    if not os.path.lexists(path):  # a link to a drive that is not there is kept
+        try:
+            write_text(path, reference_actuator())
+        except DeviceError as error:
+            raise DeviceError(f"{error} Or name another folder with --runs.") from None
+    click.echo(f"haselab: The actuator file of this twin is {path}.", err=True)
     return path
 
 

@@ -60,6 +60,7 @@ _POINTS = 300  # of a frequency response, besides those near the resonance
 _SLOWEST = 0.03  # lowest frequency shown, relative to the slowest pole
 _SHOWN_CROSSOVERS = 20.0  # length of the step, in periods of the crossover divided by 2 pi
 _LONGEST_S = 30.0
+_SETTLED = 0.02  # relative to the step
 _MOST_SAMPLES = 4000
 _LEAST, _MOST = 1e-12, 1e12  # gains
 _NO_FILE = (
@@ -176,6 +177,7 @@ def _overview(files: PanelFiles, values: JsonObject) -> JsonObject:
     warnings.append(controller_doubt(loop.path) if held is not None else "")
     answer: JsonObject = {
         "file": str(loop.path),
+        "sha256": loop.sha256,
         "kind": None if held is None else held.name or held.kind,
         "is_pid": loop.is_pid,
         "loop": {
@@ -213,7 +215,7 @@ def _evaluate(files: PanelFiles, values: JsonObject) -> JsonObject:
     found = loop.margins(gains)
     at_chip = replace(CHIP, feedthrough=loop.setting.feedthrough)
     chip = margins_answer(loop.margins(gains, at_chip), CHIP)
-    step = None if loop.no_limits else _step(loop, gains, found.crossover_rad_s)
+    step = None if loop.no_limits else _step(loop, gains, found)
     return _response(loop, gains, found) | {"gains": asdict(gains), "chip": chip, "step": step}
 
 
@@ -256,17 +258,24 @@ def _decibels_and_degrees(
     return {"magnitude_db": magnitude_db, "phase_deg": np.degrees(phase)}
 
 
-def _step(loop: DesignedLoop, gains: PidGains, crossover_rad_s: float) -> JsonObject:
-    """Step of the closed loop, saturation included, over a time of 1, 2 or 5 times 10^n s."""
-    setting = loop.setting
+def _step(loop: DesignedLoop, gains: PidGains, found: Margins) -> JsonObject:
+    """Step of the closed loop, saturation included, over a time of 1, 2 or 5 times 10^n s.
+
+    The time is long enough for several oscillations, and for a stable loop to settle.
+    """
+    setting, crossover_rad_s = loop.setting, found.crossover_rad_s
+    longest_s = min(_LONGEST_S, _MOST_SAMPLES / setting.rate_hz)
+    size = demands_of(loop.path).step or default_step(loop.plant, setting.saturation)
+    step = predicted_step(loop.plant, gains, setting, size, longest_s)
     wanted_s = _SHOWN_CROSSOVERS / crossover_rad_s if crossover_rad_s > 0.0 else _LONGEST_S
+    if found.stable:
+        moving = np.abs(step.measured - step.measured[-1]) > _SETTLED * abs(size)
+        wanted_s = max(wanted_s, 1.5 * float(step.time_s[moving].max(initial=0.0)))
     decade = 10.0 ** math.floor(math.log10(wanted_s))
     round_s = next(k * decade for k in (1.0, 2.0, 5.0, 10.0) if k * decade >= wanted_s * 0.999)
-    span_s = min(round_s, _LONGEST_S, _MOST_SAMPLES / setting.rate_hz)
-    size = demands_of(loop.path).step or default_step(loop.plant, setting.saturation)
-    found = predicted_step(loop.plant, gains, setting, size, span_s)
-    return {"time_s": found.time_s, "reference": found.reference, "measured": found.measured,
-            "controller": found.u}  # fmt: skip
+    seen = step.time_s < min(round_s, longest_s)
+    return {"time_s": step.time_s[seen], "reference": step.reference[seen],
+            "measured": step.measured[seen], "controller": step.u[seen]}  # fmt: skip
 
 
 def _design(loop: DesignedLoop, gains: PidGains) -> Design:
@@ -326,8 +335,8 @@ def _write(files: PanelFiles, values: JsonObject) -> JsonObject:
     loop, gains = opened(files), gains_of(values)
     if values.get("sha256") != loop.sha256:
         raise InputError(
-            "Not written: the actuator file has changed since the margins on this page were "
-            f"computed. Check the margins that are shown now, and write again. {loop.path}"
+            "Not written: the actuator file has changed since this page read it. Read it again, "
+            f"check its gains and margins, and write again. {loop.path}"
         )
     if not loop.margins(gains).stable:
         raise ResultError(
@@ -345,7 +354,7 @@ def _write(files: PanelFiles, values: JsonObject) -> JsonObject:
     inputs = {loop.path.name: loop.sha256}
     origin = Provenance(command, inputs, datetime.now(UTC), __version__)
     write_section(loop.path, "controller", section, origin, CONTROLLER_KEYS, loop.sha256)
-    return {"written": str(loop.path)}
+    return {"written": str(loop.path), "sha256": next(iter(hashed([loop.path]).values()))}
 
 
 DESIGN_REQUESTS: dict[str, Callable[[PanelFiles, JsonObject], JsonObject]] = {

@@ -22,6 +22,7 @@ __all__ = ["analyse", "analyse_recorded", "compare", "listed", "note", "report"]
 
 _NOTES, _LOG = "notes.txt", "analysis.log"
 _MOST_LETTERS = 10_000
+_MOST_REPORT = 10_000_000  # bytes; those of haselab have at most 3 MB
 _MOST_FOLDERS = 2000
 _running: dict[Path, subprocess.Popen[bytes]] = {}  # analyses by folder
 _starting, _noting = threading.Lock(), threading.Lock()
@@ -61,13 +62,14 @@ def listed(files: PanelFiles, values: JsonObject) -> JsonObject:
         files: of the panel.
         values: none.
     Returns:
-        `folder` and `recordings`: name, study, date, seconds, state, whether it is open (being
-        recorded, or interrupted), note, whether it is being analysed, what the last analysis failed
-        with, and whether there is a report.
+        `folder`, whether it `is_there`, and `recordings`: name, study, date, seconds, state,
+        whether it is open (being recorded, or interrupted), note, whether it is being analysed,
+        what the last analysis failed with, and whether there is a report.
     """
     found = [_described(path) for path in _folders(files)]
     found.sort(key=lambda one: str(one["opened"]), reverse=True)
-    return {"folder": str(files.runs.resolve()), "recordings": found}
+    there = files.runs.is_dir()
+    return {"folder": str(files.runs.resolve()), "is_there": there, "recordings": found}
 
 
 def _described(folder: Path) -> dict[str, Any]:
@@ -173,17 +175,24 @@ def report(files: PanelFiles, values: JsonObject) -> JsonObject:
     Returns:
         `html`.
     Raises:
-        InputError: there is no such recording, or no report yet.
+        InputError: there is no such recording, no report yet, or one that is too large.
     """
     folder = _recording(files, values.get("name"))
-    try:
-        return {"html": read_text(folder / "report.html")}
-    except InputError:
+    path = folder / "report.html"
+    if not path.is_file():
         why = " ".join(_read(folder / _LOG).split())
         raise InputError(
             f"There is no report of {folder.name} yet."
             + (f" Messages of the last analysis: {why}" if why else " Press Analyse.")
-        ) from None
+        )
+    size = path.stat().st_size
+    if size > _MOST_REPORT:
+        raise InputError(
+            f"The report has {1e-6 * size:.0f} MB, but the panel shows at most "
+            f"{1e-6 * _MOST_REPORT:.0f} MB: a larger one would keep STOP waiting. Open it in a "
+            f"browser of its own. {path}"
+        )
+    return {"html": read_text(path, "report")}
 
 
 def analyse(files: PanelFiles, values: JsonObject) -> JsonObject:

@@ -10,11 +10,12 @@ export function limitOf(state, v = state.limit_v) {
   return `${sign}${fixed(v, 3)} V (${sign}${fixed(v * state.gain / 1000, 2)} kV)`;
 }
 
-// What was refused; it is scrolled into view.
-export function Said({ error }) {
+// What was refused, or done; it is scrolled into view.
+export function Said({ error, done = "" }) {
   const place = useRef(null);
-  useEffect(() => { place.current?.scrollIntoView({ block: "nearest" }); }, [error]);
-  return error ? html`<p class="error" role="alert" ref=${place}>${error}</p>` : null;
+  useEffect(() => { place.current?.scrollIntoView({ block: "nearest" }); }, [error, done]);
+  if (error) return html`<p class="error" role="alert" ref=${place}>${error}</p>`;
+  return html`<p role="status" ref=${place}>${done}</p>`;
 }
 
 // Two steps: read the limits, then type one. With a study, the bench is armed to play it.
@@ -77,9 +78,11 @@ export function Progress({ state }) {
 
 // A study that this page has started: what it does, what a person must do, and how to end it.
 export function Playing({ state, link, say }) {
+  const place = useRef(null);
+  useEffect(() => { place.current?.scrollIntoView({ block: "center" }); }, []);
   const ask = (what, values = {}) => link.ask(what, values).then((found) => say(found.error || ""));
   return html`
-    <p class="badge live">Playing a study, up to ${limitOf(state)}</p>
+    <p class="badge live" ref=${place}>Playing a study, up to ${limitOf(state)}</p>
     <${Progress} state=${state} />
     ${state.prompt && html`<div class="card warning" role="alert"><p>${state.prompt}</p>
       <button type="button" onClick=${() => ask("confirm", { step: state.step })}>Done</button></div>`}

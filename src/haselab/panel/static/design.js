@@ -94,6 +94,8 @@ function Margins({ found, caption }) {
     ${rows.map(([name, value]) => html`<tr><th scope="row">${name}</th><td>${value}</td></tr>`)}</tbody></table>`;
 }
 
+const summary = (found) => (found.stable ? `Stable, phase margin ${digits(found.phase_margin_deg ?? Infinity, 3)}°, gain margin ${digits(found.gain_margin_db ?? Infinity, 3)} dB.` : html`<strong class="error">UNSTABLE.</strong>`);
+
 function Budget({ found }) {
   const share = (used, all, unit) => `${used.toLocaleString("en")} of ${all.toLocaleString("en")} ${unit} (${digits(100 * used / all, 3)} %)`;
   return html`<table class="margins"><caption>Measured in co-simulation, with the loop closed on a twin for 1 s</caption><tbody>
@@ -163,10 +165,11 @@ export default function Design({ link, state }) {
   }
   async function write() {
     if (GAINS.some(({ name }) => fields.current[name]?.() === null)) { say({ text: "Not written: a field has no valid number.", bad: true }); return; }
-    const answer = await during("write", () => link.request("design-write", { ...gains, sha256: found.sha256 }));
+    const answer = await during("write", () => link.request("design-write", { ...gains, sha256: about.sha256 }));
     if (answer.error) say({ text: answer.error, bad: true });
     else {
       unwritten = null;
+      see({ ...about, sha256: answer.sha256 });
       const next = state?.holder ? "The armed bench keeps its present controller. Disarm it and arm it again to use the new one." : "Press Arm the bench on the page Live to use it.";
       say({ text: `Written to ${answer.written}. ${next}`, bad: false });
     }
@@ -191,11 +194,13 @@ export default function Design({ link, state }) {
         ${about.kind === null && html`<p>The file has no controller yet. Compute gains, or move the sliders.</p>`}
         ${gains === null && html`<p>The controller has kind = ${about.kind}, but this page changes only the gains of a PI or PID. Edit its parameters in the file.</p>`}
         ${gains !== null && GAINS.map((one) => html`<${Gain} key=${one.name} about=${one} value=${gains[one.name]} highest=${about.ranges[one.name]} put=${put(one.name)} fields=${fields.current} />`)}
+        ${isShown && html`<p class=${isNew ? "" : "old"}>${summary(found.margins)}${same(demands?.gains ?? null, gains) && demands?.shortfalls?.length ? html` <span class="error">Demands not met, see Margins.</span>` : ""}</p>`}
+        ${isShown && found.sha256 !== about.sha256 && html`<p class="error" role="alert">The file has changed since this page read it. Read it again; the gains that you changed here are then lost.</p>`}
         ${gains !== null && html`<div class="row">
           <button type="button" disabled=${busy !== ""} onClick=${compute}>${busy === "compute" ? "Computing …" : "Compute gains"}</button>
           <button type="button" disabled=${busy !== ""} onClick=${reopen}>Read the file again</button>
           <button type="button" disabled=${busy !== "" || !isShown} onClick=${write}>Write to the actuator file</button></div>`}
-        ${said.bad ? html`<${Said} error=${said.text} />` : html`<p role="status">${said.text}</p>`}
+        <${Said} error=${said.bad ? said.text : ""} done=${said.text} />
       </div>
       ${isShown && html`<div class=${`card ${isNew ? "" : "old"}`}><h2>Margins</h2>
         <${Margins} found=${found.margins} caption=${`At ${digits(found.margins.rate_hz)} Hz with a delay of ${digits(1e3 * found.margins.delay_s)} ms`} />

@@ -82,14 +82,14 @@ function Live({ state, say }) {
     <${Slider} name="Drive" unit="V" low=${low} high=${state.limit_v} step="0.01" value=${state.target_v}
       about=${`now ${kilo(state.drive_v, state.gain)}, ${state.mode === "loop" ? "set by the controller" : `changes by 1 V/s (${Number((state.gain / 1000).toPrecision(3))} kV/s at the output)`}`} send=${(v) => ask("drive", { value_v: v })} />
     ${state.loop === null
-      ? html`<p>The loop cannot be closed. Start the panel with <code>--actuator FILE</code>, where FILE is an actuator file with both maps and a controller. A study with <code>[triangle]</code>, <code>[chirp]</code> and <code>[steps]</code> writes one, actuator.toml, into the folder of its recording. For one from example records, run <code>haselab example actuator --out example</code> and follow its README.md.</p>`
+      ? html`<p>The loop cannot be closed: there is no actuator file with both maps and a controller. Start the panel with <code>--actuator FILE</code>. A study with <code>[triangle]</code>, <code>[chirp]</code> and <code>[steps]</code> writes one, actuator.toml, into the folder of its recording. For one from example records, run <code>haselab example actuator --out example</code> and follow its README.md.</p>`
       : html`<${Slider} name="Desired strain" unit="%" low=${100 * state.loop[0]} high=${100 * state.loop[1]} step="0.1"
           value=${100 * (state.reference ?? 0)} about=${state.mode === "loop" ? "closed loop" : "the loop is open; moving this slider closes it, and the drive jumps to what the controller puts out"}
           send=${(v) => ask("loop", { strain: v / 100 })} />`}
     <div class="row">
       <button type="button" onClick=${() => ask("drive", { value_v: 0 })}>Ramp to 0 V</button>
       ${state.mode === "loop" && html`<button type="button" onClick=${() => ask("open")}>Open the loop</button>`}
-      <button type="button" onClick=${() => ask("disarm")}>Disarm</button>
+      <button type="button" onClick=${() => ask("disarm").then(() => scrollTo(0, 0))}>Disarm</button>
     </div>`;
 }
 
@@ -168,13 +168,17 @@ function Panel() {
   document.body.classList.toggle("lost", lost);
   leaving.asks = mine && !lost;
   const stage = state ? `${STAGES[state.stage] ?? state.stage}${live ? `, ${kilo(state.drive_v, state.gain)}` : ""}` : "";
+  const bench = state === null ? "Bench: unknown" : stale ? `Bench: unknown (last: ${stage})` : `Bench: ${stage}`;
+  const corner = document.getElementById("corner-state"), said = stale ? `${age}. ${bench}` : bench;
+  if (corner.textContent !== said) corner.textContent = said;
+  corner.className = stale || tripped ? "bad" : live ? "live" : "";
   const old = "What is shown of the bench is old, and commands are not carried out.";
   const jumped = typeof frame?.gap_s === "number" && frame.gap_s > (link.view.end_s ?? frame.end_s) - link.view.span_s;
   return html`
     <header>
       <h1>${state ? state.name : "haselab panel"}</h1>
       ${state?.simulated && html`<span class="badge">SIMULATED</span>`}
-      <span class=${`badge ${live ? "live" : ""} ${stale || state?.stage === "tripped" ? "bad" : ""}`} role="status">${state === null ? "Bench: unknown" : stale ? `Bench: unknown (last: ${stage})` : `Bench: ${stage}`}</span>
+      <span class=${`badge ${live ? "live" : ""} ${stale || tripped ? "bad" : ""}`} role="status">${bench}</span>
       <span id="age" class=${`badge ${stale ? "bad" : paused ? "live" : ""}`} role="status">${stale ? age : paused ? `VIEW PAUSED at ${link.view.end_s.toFixed(1)} s` : "data live"}</span>
     </header>
     <nav class="row" aria-label="Pages">
@@ -198,13 +202,13 @@ function Panel() {
           <fieldset class="plain" disabled=${lost}>
           ${link.problem && html`<p class="error" role="alert">${link.problem}</p>`}
           <${Said} error=${error} />
-          ${state?.extrapolated && html`<p class="error" role="status">The strain is extrapolated: the capacitance is outside the range of the strain map.</p>`}
           ${state?.reason && html`<p class=${state.stage === "tripped" ? "error" : ""}>Last message of the bench: ${state.reason}${!live && state.drive_v === 0 ? " The drive is 0 V." : ""}</p>`}
           ${state === null ? html`<p>No data from the bench process. If this does not change, read the messages in the terminal of haselab panel.</p>`
             : mine ? html`<${Live} state=${state} say=${say} />`
             : live ? html`<p class="badge live">Armed by another page up to ${limitOf(state)}</p>
               ${state.mode === "study" && html`<p>It plays a study.</p><${Progress} state=${state} />`}`
             : html`<${Arming} state=${state} link=${link} say=${say} />`}
+          ${state?.extrapolated && html`<p class=${state.mode === "loop" ? "error" : ""} role="status">The sensed strain is extrapolated: the capacitance is outside the range of the strain map${state.mode === "loop" ? "" : ", as it may be near 0 V"}.</p>`}
           </fieldset>
         </div>
         <${Camera} filming=${live} />

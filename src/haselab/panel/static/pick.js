@@ -196,7 +196,7 @@ function Chosen({ mark, work, picture, remove }) {
     <div class="row"><label>x, in px <input ...${x.field} /></label><label>y, in px <input ...${y.field} /></label><button type="button" onClick=${remove}>Delete</button></div>${x.line}${y.line}</div>`;
 }
 
-function Picker({ link }) {
+function Picker({ link, isArmed }) {
   const [list, setList] = useState(null);
   const [video, setVideo] = useState(kept.video);
   const [index, setIndex] = useState(0);
@@ -365,7 +365,7 @@ function Picker({ link }) {
       <p>${done.scale_mm_per_px ? `Scale: ${done.scale}. ` : "No scale: lengths stay in pixels. "}Track the points with this command:</p><p><code>${done.command}</code></p></div>`;
   if (done && list.only) return html`${saved}<p>haselab track --pick has ended. Close this page.</p>`;
   return html`
-    ${!list.only && html`<label>Video <select value=${video} onChange=${(e) => open(e.target.value)}>
+    ${!list.only && html`<label>Video <select value=${video} disabled=${isArmed} onChange=${(e) => open(e.target.value)}>
       <option value="">Choose one of ${list.more ? "the first " : ""}${list.videos.length} below ${list.folder}</option>
       ${list.videos.map((name) => html`<option value=${name}>${name}</option>`)}</select></label>`}
     ${!list.only && !list.videos.length && html`<p>There is no video below ${list.folder}. Start haselab panel with --runs DIR, or use haselab track --pick VIDEO.</p>`}
@@ -409,7 +409,8 @@ function Picker({ link }) {
       </section></div>`}`;
 }
 
-// The panel draws its pages with every frame of data, but nothing changes here then.
-export default function Pick({ link }) {
-  return useMemo(() => html`<${Picker} link=${link} />`, [link]);
+// The panel draws its pages with every frame of data, but nothing else changes here then.
+export default function Pick({ link, state }) {
+  const isArmed = Boolean(state?.holder); // an open list would take the key of STOP
+  return useMemo(() => html`<${Picker} link=${link} isArmed=${isArmed} />`, [link, isArmed]);
 }

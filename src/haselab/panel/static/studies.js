@@ -44,24 +44,24 @@ function Chooser({ link, state, mine, onEnd }) {
   return html`<div class="card"><h2>Study</h2>
     <${Said} error=${error} />
     ${state?.reason && html`<p role="status">Last message of the bench: ${state.reason}</p>`}
-    <label>Study <select value=${chosen.study} onChange=${(e) => pick(list, e.target.value)}>
+    <label>Study <select value=${chosen.study} disabled=${busy} onChange=${(e) => pick(list, e.target.value)}>
       ${list.map((one) => html`<option value=${one.name}>${one.name}</option>`)}</select></label>
     <fieldset><legend>Experiments</legend>
       ${titles.map((one) => html`<label><input type="checkbox" checked=${chosen.experiments.includes(one.table)}
         onChange=${(e) => toggle(one.table, e.target.checked)} /> ${one.title} (${one.table})</label>`)}</fieldset>
     <label><input type="checkbox" checked=${chosen.quick} onChange=${(e) => change({ quick: e.target.checked })} /> Short version</label>
     <label><input type="checkbox" checked=${chosen.keep_video === "none"} onChange=${(e) => change({ keep_video: e.target.checked ? "none" : "sample" })} /> Keep no camera frames</label>
-    <div class="row"><button type="button" disabled=${checked === "checking" || chosen.experiments.length === 0} onClick=${check}>Check</button>
+    <div class="row"><button type="button" disabled=${checked === "checking" || chosen.experiments.length === 0} onClick=${check}>Check, then play …</button>
       ${chosen.experiments.length === 0 && html`<span>Tick an experiment first.</span>`}</div>
     ${checked === "checking" && html`<p role="status">Checking the study against the limits of the bench …</p>`}
     ${checked !== null && checked !== "checking" && html`
       <p role="status">${!checked.rated ? "The rating of this bench is not known (the rig file has no [rating]), so the study was not checked against it."
-        : checked.ok ? `The bench can play this study. It takes ${when(checked.seconds)} on a real bench${state?.simulated ? "; this simulated bench may be faster" : ""}. Its highest drive is ${kilo(checked.highest_v, state?.gain ?? 1)}.` : "The bench cannot play this study."}</p>
+        : checked.ok ? `The bench can play this study. It takes ${when(checked.seconds)} on a real bench${state?.simulated ? ", and a fraction of this time on this simulated one" : ""}. Its highest drive is ${kilo(checked.highest_v, state?.gain ?? 1)}.` : "The bench cannot play this study."}</p>
+      ${checked.ok && (busy ? html`<p>${mine ? "The bench is armed. Disarm it on the page Live before you play a study." : "The bench is armed by another page. Disarm it there before you play a study."}</p>`
+        : state && html`<${Arming} state=${state} link=${link} say=${say} study=${{ ...chosen, sha256: checked.sha256 }} onArmed=${() => setChecked(null)} />`)}
       ${checked.checks.length > 0 && html`<table class="wide"><thead><tr><th scope="col">Check</th><th scope="col">Where</th><th scope="col">Needed</th><th scope="col">Limit</th><th scope="col">What to do</th></tr></thead>
         <tbody>${checked.checks.map((one) => html`<tr><td data-label="Check">${one.name}</td><td data-label="Where">${one.where}</td><td data-label="Needed" class=${one.ok ? "" : "error"}>${number(one.requested)} ${one.unit}</td>
-          <td data-label="Limit">${number(one.limit)} ${one.unit}</td><td data-label="What to do">${one.ok ? "nothing" : one.advice}</td></tr>`)}</tbody></table>`}
-      ${checked.ok && (busy ? html`<p>${mine ? "The bench is armed. Disarm it on the page Live before you play a study." : "The bench is armed by another page. Disarm it there before you play a study."}</p>`
-        : state && html`<${Arming} state=${state} link=${link} say=${say} study=${{ ...chosen, sha256: checked.sha256 }} onArmed=${() => setChecked(null)} />`)}`}
+          <td data-label="Limit">${number(one.limit)} ${one.unit}</td><td data-label="What to do">${one.ok ? "nothing" : one.advice}</td></tr>`)}</tbody></table>`}`}
   </div>`;
 }
 
@@ -84,11 +84,18 @@ const drafts = new Map(); // notes that are typed and not saved, by recording, w
 function Note({ name, saved, keep }) {
   const [draft, set] = useState(drafts.get(name) ?? null);
   const change = (next) => { if (next === null) drafts.delete(name); else drafts.set(name, next); set(next); };
-  const type = (text) => change({ text, before: draft === null ? saved : draft.before });
+  const type = (text) => { say(""); change({ text, before: draft === null ? saved : draft.before }); };
   const differs = draft !== null && draft.before !== saved && draft.text !== saved;
+  const sending = useRef(null); // the button takes the focus from the field, which saves as well
+  const [said, say] = useState("");
   async function save(before) {
     const sent = draft.text;
-    if (sent !== before && !(await keep(name, sent, before))) return;
+    if (sending.current === sent) return;
+    sending.current = sent;
+    const error = sent === before ? "" : await keep(name, sent, before);
+    sending.current = null;
+    say(error || "Saved.");
+    if (error) return;
     if (drafts.get(name)?.text === sent) change(null); // nobody typed meanwhile
     else change({ ...drafts.get(name), before: sent });
   }
@@ -96,6 +103,7 @@ function Note({ name, saved, keep }) {
   return html`<textarea aria-label=${`Note about ${name}`} rows="2" value=${draft === null ? saved : draft.text} onInput=${(e) => type(e.target.value)}
       onBlur=${() => draft !== null && !differs && save(saved)}></textarea>
     ${isTyped && html`<button type="button" onClick=${() => save(saved)}>Save</button>`}
+    ${said && html`<p class=${said === "Saved." ? "" : "error"} role=${said === "Saved." ? "status" : "alert"}>${said}</p>`}
     ${differs && html`<p class="error" role="alert">Not saved: meanwhile, the note was changed to “${saved}”.</p>
       <div class="row"><button type="button" onClick=${() => save(saved)}>Save what I typed instead</button>
         <button type="button" onClick=${() => change(null)}>Discard what I typed</button></div>`}`;
@@ -104,12 +112,21 @@ function Note({ name, saved, keep }) {
 // A report, in this page, so that STOP stays in view; it has no scripts, and none would run.
 function Report({ name, text, close }) {
   const place = useRef(null);
+  const [lost, lose] = useState(false);
   const address = useMemo(() => URL.createObjectURL(new Blob([text], { type: "text/html" })), []);
   useEffect(() => { place.current.scrollIntoView(); place.current.focus({ preventScroll: true }); return () => URL.revokeObjectURL(address); }, []);
+  // Esc must press STOP also while the focus is in the report: nothing else may take the keys there.
+  function loaded({ target }) {
+    const found = target.contentDocument;
+    if (!found?.URL.startsWith(address)) { lose(true); place.current.focus(); return; }
+    found.querySelectorAll("iframe, frame, object, embed, select, input, textarea").forEach((one) => one.remove());
+    window.listenForStop(found);
+  }
   return html`<div class="card report"><h2 ref=${place} tabindex="-1">Report of ${name}</h2>
     <div class="row"><button type="button" onClick=${close}>Close the report</button>
       <span>For a tab of its own, open report.html in the folder of the recording.</span></div>
-    <iframe title=${`Report of ${name}`} sandbox="allow-same-origin" src=${address} onLoad=${(e) => { if (e.target.contentDocument) window.listenForStop(e.target.contentDocument); }}></iframe></div>`;
+    ${lost ? html`<p class="error" role="alert">A link in the report led elsewhere, which this page does not show. Close the report, and open it again.</p>`
+      : html`<iframe title=${`Report of ${name}`} sandbox="allow-same-origin" src=${address} onLoad=${loaded}></iframe>`}</div>`;
 }
 
 const MOST_ROWS = 100; // more are drawn on request: thousands would block the page, and the bench would be lost
@@ -133,7 +150,7 @@ function Recordings({ link, mode, recording }) {
   async function open(name) {
     const answer = await link.request("report", { name });
     say(answer.error || "");
-    show(answer.error ? null : { name, text: answer.html });
+    show(answer.error ? null : { name, text: answer.html, at: performance.now() });
   }
   async function analyse(name) {
     const answer = await link.request("analyse", { name });
@@ -143,8 +160,7 @@ function Recordings({ link, mode, recording }) {
   async function keep(name, text, before) {
     const answer = await link.request("note", { name, text, before });
     await read();
-    say(answer.error || "");
-    return !answer.error;
+    return answer.error || "";
   }
   const wanted = search.toLowerCase().split(/\s+/).filter(Boolean);
   const all = wanted.length === 0 ? found.recordings : found.recordings.filter((one) => {
@@ -152,11 +168,11 @@ function Recordings({ link, mode, recording }) {
     return wanted.every((word) => text.includes(word));
   });
   const toggle = (name, on) => mark(on ? [...marked, name].slice(-2) : marked.filter((one) => one !== name));
-  return html`${shown && html`<${Report} key=${shown.name} name=${shown.name} text=${shown.text} close=${() => show(null)} />`}
+  return html`${shown && html`<${Report} key=${shown.at} name=${shown.name} text=${shown.text} close=${() => show(null)} />`}
     ${compared && html`<${Comparison} link=${link} names=${compared} close=${() => setCompared(null)} />`}
     <div class="card"><h2>Recordings</h2>
     ${error && html`<p class="error" role="alert">${error}</p>`}
-    <p>${found.recordings.length} in ${found.folder}</p>
+    <p>${found.recordings.length} in ${found.folder}${found.is_there === false ? ", which does not exist" : ""}</p>
     <label>Search <input type="search" value=${search} onInput=${(e) => setSearch(e.target.value)} /></label>
     <div class="row"><button type="button" disabled=${marked.length !== 2} onClick=${() => setCompared(marked)}>Compare the two that are marked</button></div>
     <table class="wide"><thead><tr><th scope="col">Mark</th><th scope="col">Recording</th><th scope="col">Study</th><th scope="col">Ended</th><th scope="col">Note</th><th scope="col">Results</th></tr></thead>

@@ -96,7 +96,10 @@ class LoopWatchdog:
         settled: bool = True,
     ) -> None:
         self._model, self._settings, self._rating = model, settings, rating
-        self._map = model.map_drive_v.tolist(), model.map_strain.tolist()
+        self._map: tuple[list[float], list[float]] = (
+            model.map_drive_v.tolist(),
+            model.map_strain.tolist(),
+        )
         self._plausible = Plausible(model, settings)
         self._blocks = _blocks(model.block_s, settings)
         self._strains = Repeats(

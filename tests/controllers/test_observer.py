@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from dataclasses import replace
+from dataclasses import fields, replace
 from itertools import pairwise
 
 import numpy as np
@@ -13,7 +13,7 @@ from hypothesis import strategies as st
 
 from haselab.actuators import CurlingHasel, DeaStack, Drive, PeanoHasel, PlanarHasel, SampledLaw
 from haselab.base import ResultError
-from haselab.controllers import CONTROLLERS, KnownActuator
+from haselab.controllers import CONTROLLERS, KnownActuator, observer_design
 from haselab.controllers.linear_loop import (
     Demands,
     LinearLoop,
@@ -107,6 +107,19 @@ def test_the_linear_loop_follows_the_controller_and_the_motion(known, delay, str
         expected.append(float(loop.length @ states))
     if np.abs(found).max() < 1e-3:  # else it is unstable, and no longer a small change
         assert np.abs(np.subtract(found, expected)).max() < 0.02 * np.abs(expected).max()
+
+
+def test_loops_of_a_design_share_steps_without_changing_a_bit(known):
+    """Another plant of the same law, and another law with the same plant, reuse what they can."""
+    setting = replace(setting_for(DESIGNED, HOST, known, 0.0), delay_s=0.017)
+    any_law, motions = ObserverLaw(setting, 10.0, 1.0, 0.01), {}
+    for bandwidth in (20.0, 35.0):
+        steps = observer_design._Steps({}, motions)
+        for other in ((1.1, 0.0), (0.9, 0.004), (1.0, 0.011)):
+            alone = linear_loop(ObserverLaw(setting, bandwidth, 0.3, 0.01), setting, 0.03, other)
+            shared = linear_loop(any_law.tuned(bandwidth, 0.3), setting, 0.03, other, steps)
+            for field in fields(LinearLoop):
+                assert np.array_equal(getattr(alone, field.name), getattr(shared, field.name))
 
 
 def test_the_stated_delay_margin_is_that_of_the_played_loop(known):

@@ -58,6 +58,18 @@ def second_order(x: np.ndarray, omega: float, zeta: float, gain: float) -> np.nd
     return out
 
 
+@pytest.mark.parametrize("flat", [False, True])
+def test_the_static_strain_is_the_interpolated_one_also_beyond_the_map(flat) -> None:
+    volts = MODEL.map_drive_v.copy()
+    if flat:  # parts of the map at one drive
+        volts[:3], volts[-3:], volts[50:54] = volts[0], volts[-1], volts[50]
+    watchdog = LoopWatchdog(replace(MODEL, map_drive_v=volts), SETTINGS)
+    random = np.random.default_rng(4).uniform(volts[0] - 0.5, volts[-1] + 0.5, 2000)
+    for drive_v in [*random.tolist(), *volts.tolist(), math.inf, -math.inf, math.nan]:
+        wanted = float(np.interp(drive_v, volts, MODEL.map_strain))
+        assert np.array_equal(watchdog._static(drive_v), wanted, equal_nan=True)
+
+
 @pytest.mark.parametrize("omega", [8.0, 15.0, 33.0, 60.0])
 @pytest.mark.parametrize("gain", [0.3, 1.0])
 def test_the_direction_of_a_plant_is_found_without_knowing_the_plant(omega, gain) -> None:

@@ -5,6 +5,7 @@ from __future__ import annotations
 import functools
 import math
 from collections.abc import Callable, Iterable, Iterator, Mapping
+from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
@@ -79,15 +80,19 @@ def _design(setting: ControllerSetting) -> Mapping[str, float]:
     delay_s = (setting.delay_s or 0.0) + 0.5 * setting.period_s
     allowed_v = setting.highest_rate_per_s * setting.period_s
 
+    any_law = ObserverLaw(setting, 1.0 / delay_s, known.mass_kg * GRAVITY_M_S2, SHAKE_M_S2)
+    motions: _Motions = {}
+
     def loops(bandwidth: float, load_n: float) -> Iterator[tuple[LinearLoop, Demands]]:
-        law = ObserverLaw(setting, bandwidth, load_n, SHAKE_M_S2)
+        law, known_steps = any_law.tuned(bandwidth, load_n), _Steps({}, motions)
         for strain in strains:
             noise_m = known.length_noise_m(strain)
             for stiffness, longer, peak in _SPREAD:
                 demands = Demands(
                     noise_m, _SHAKEN * known.high_v, peak, _MOVED, _CHANGED * allowed_v
                 )
-                yield linear_loop(law, setting, strain, (stiffness, longer * delay_s)), demands
+                other = stiffness, longer * delay_s
+                yield linear_loop(law, setting, strain, other, known_steps), demands
 
     # beyond, limits of the drive hide what the feedback does
     return best_parameters(loops, setting, evaluations=60, fastest_rad_s=1.0 / delay_s)
@@ -148,6 +153,24 @@ def best_parameters(
             "shake_m_s2": SHAKE_M_S2, "reserve": RESERVE}  # fmt: skip
 
 
+# by what they depend on
+_Updates = dict[tuple[float, ...], tuple[list[float], float]]
+_Motions = dict[tuple[float, ...], list[float]]
+
+
+@dataclass(frozen=True)
+class _Steps:
+    """Steps that were computed before, since the loops of a design share many.
+
+    Args:
+        updates: of one law: state of the observer and new drive.
+        motions: of one actuator, whatever the law: its state after an update.
+    """
+
+    updates: _Updates
+    motions: _Motions
+
+
 class _Joint:
     """Actuator and observer as one system, about the rest at a strain.
 
@@ -156,15 +179,17 @@ class _Joint:
         setting: of the loop.
         strain: held.
         other: stiffness of the actuator over the identified one; delay beyond the stated one, s.
+        known_steps: of other loops with this law or this actuator.
     """
 
     def __init__(
         self, law: ObserverLaw, setting: ControllerSetting, strain: float,
-        other: tuple[float, float],
+        other: tuple[float, float], known_steps: _Steps,
     ) -> None:  # fmt: skip
         known, period_s = setting.actuator, setting.period_s
         assert known is not None
         self._law, self._length_m = law, known.length_m(strain)
+        self._steps, self._case = known_steps, (strain, *other)
         drive_v = known.static_drive_v(strain)
         self._plant = law.model.stiffened(self._length_m, other[0])
         rest = law.model.at_rest(self._length_m, drive_v)
@@ -180,17 +205,40 @@ class _Joint:
         moved, size = (self.start + change).tolist(), self.size
         true = [*moved[: size - 1], self._load_n + load_n]
         seen, past_v = moved[size - 1 : 2 * size - 1], moved[2 * size - 1 :]
-        law, plant = self._law, self._plant
-        seen = law.observed(seen, past_v, true[0] + noise_m)
-        new_v = law.drive_v(law.ahead(seen, past_v), (self._length_m, 0.0, 0.0), _FREE)
+        seen, new_v = self._updated(seen, past_v, true[0] + noise_m)
         past_v = [new_v, *past_v[:-1]]
-        true = plant.moved(true, past_v[self._whole + 1] + added_v, self._late_s)
-        true = plant.moved(true, past_v[self._whole] + added_v, self._period_s - self._late_s)
-        return np.array([*true[:-1], *seen, *past_v])
+        before_v, after_v = (past_v[self._whole + k] + added_v for k in (1, 0))
+        return np.array([*self._moved(true, before_v, after_v)[:-1], *seen, *past_v])
+
+    def _updated(
+        self, seen: list[float], past_v: list[float], sensed_m: float
+    ) -> tuple[list[float], float]:
+        """State of the observer after an update, and the new drive."""
+        law, updates = self._law, self._steps.updates
+        used_v = past_v[: law.whole + 2]
+        key = (self._length_m, sensed_m, *seen, *used_v)
+        if key not in updates:
+            found = law.observed(seen, used_v, sensed_m)
+            ahead = law.ahead(found, used_v)
+            updates[key] = found, law.drive_v(ahead, (self._length_m, 0.0, 0.0), _FREE)
+        return updates[key]
+
+    def _moved(self, true: list[float], before_v: float, after_v: float) -> list[float]:
+        """State of the actuator after an update, during which the drive changes."""
+        motions, late_s = self._steps.motions, self._late_s
+        key = (*self._case, *true, before_v, after_v)
+        if key not in motions:
+            begun = self._plant.moved(true, before_v, late_s)
+            motions[key] = self._plant.moved(begun, after_v, self._period_s - late_s)
+        return motions[key]
 
 
 def linear_loop(
-    law: ObserverLaw, setting: ControllerSetting, strain: float, other: tuple[float, float]
+    law: ObserverLaw,
+    setting: ControllerSetting,
+    strain: float,
+    other: tuple[float, float],
+    known_steps: _Steps | None = None,
 ) -> LinearLoop:
     """The closed loop where it holds a strain, by central differences, its rate limit apart.
 
@@ -199,8 +247,9 @@ def linear_loop(
         setting: of the loop.
         strain: held.
         other: stiffness of the actuator over the identified one; delay beyond the stated one, s.
+        known_steps: of other loops with this law or this actuator, which are added to; None: none.
     """
-    joint = _Joint(law, setting, strain, other)
+    joint = _Joint(law, setting, strain, other, known_steps or _Steps({}, {}))
     small = [1e-7, 1e-5, *[1e-4] * (joint.size - 3)]  # m, m/s, N
     scales = [*small, *small, 1e-4, *[1e-5] * joint.waiting]
     none = np.zeros(len(scales))

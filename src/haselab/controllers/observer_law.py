@@ -73,7 +73,27 @@ class ObserverLaw:
         self._low_v, self._high_v = max(setting.drive_low, 0.0), setting.drive_high
         low, high = known.reachable()
         self._strains = np.linspace(low, high, _POINTS).tolist()
+        self._rests = [
+            (
+                self.model.linear(known.length_m(strain), known.static_drive_v(strain), period_s),
+                known.length_noise_m(strain),
+            )
+            for strain in self._strains
+        ]
         self._gains = self._steady_gains()
+
+    def tuned(self, bandwidth_rad_s: float, load_n: float) -> ObserverLaw:
+        """The same law with another bandwidth and expected load.
+
+        Args:
+            bandwidth_rad_s: see `ObserverController`.
+            load_n: see `ObserverController`.
+        """
+        found = copy(self)
+        found._per_m, found._per_m_s = critical_feedback(bandwidth_rad_s, self._period_s)
+        found._load_n = load_n
+        found._gains = found._steady_gains()
+        return found
 
     def observed(self, state: list[float], past_v: list[float], length_m: float) -> list[float]:
         """The state one period later, corrected by the sensed length.
@@ -149,8 +169,8 @@ class ObserverLaw:
 
     def _steady_gains(self) -> list[list[float]]:
         """Gains of Kalman's filter at rest, at each strain."""
-        known, model, period_s = self._known, self.model, self._period_s
-        branches = len(known.law.losses.branch_share)
+        model, period_s = self.model, self._period_s
+        branches = len(model.branches)
         creep = (_CREEP * model.weight_n) ** 2 * period_s
         noise = np.diag([0.0, 0.0, *[creep] * branches, self._load_n**2 * period_s])
         noise[:2, :2] = process_noise(self._shake, period_s)
@@ -158,10 +178,9 @@ class ObserverLaw:
         seen = np.zeros((1, unit.size))
         seen[0, 0] = 1.0
         gains = []
-        for strain in self._strains:
-            drive_v = known.static_drive_v(strain)
-            a = model.linear(known.length_m(strain), drive_v, period_s) * unit / unit[:, None]
-            missed = (known.length_noise_m(strain) / unit[0]) ** 2
+        for linear, noise_m in self._rests:
+            a = linear * unit / unit[:, None]
+            missed = (noise_m / unit[0]) ** 2
             p = solve_discrete_are(a.T, seen.T, noise / np.outer(unit, unit), [[missed]])
             gains.append((p[:, 0] / (p[0, 0] + missed) * unit / unit[0]).tolist())
         return gains

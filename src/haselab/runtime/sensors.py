@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from typing import Protocol
 
 import numpy as np
@@ -61,6 +62,7 @@ class CapacitanceSensor:
     def __init__(self, lockin: Lockin, to_strain: StrainMap) -> None:
         self._lockin, self._map = lockin, to_strain
         self._usable_f = to_strain.usable_f
+        self._fitted_f = to_strain.range_f or (-math.inf, math.inf)
         self.capacitance_f: float | None = None
         self.in_range = True
         self._reason = 0
@@ -73,7 +75,8 @@ class CapacitanceSensor:
         if not valid:
             self._reason = int(self._lockin.sense(codes[np.newaxis]).reason[0])
             return float("nan")
-        self.in_range = bool(self._map.inside(capacitance_f))
+        low_f, high_f = self._fitted_f
+        self.in_range = low_f <= capacitance_f <= high_f
         low_f, high_f = self._usable_f
         if not low_f <= capacitance_f <= high_f:
             return float("nan")

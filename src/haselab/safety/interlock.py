@@ -300,6 +300,8 @@ class Interlock:
     @property
     def revision(self) -> int:
         """Random number, replaced by every revocation; `DAMAGED` if the file is not valid."""
+        if not self.key:  # no other process can damage it
+            return int(_WHOLE.unpack_from(self._private, _REVISION)[0])
         return self._get(_REVISION) if self.intact else DAMAGED
 
     @property
@@ -467,7 +469,7 @@ class Interlock:
         token = object()
         try:
             acquired = self._output.acquire(token, wait_s)
-            if acquired:
+            if acquired and self.key:
                 with contextlib.suppress(OSError):  # then no holder is killed
                     self._put(_HOLDER, os.getpid())
             return act(acquired)

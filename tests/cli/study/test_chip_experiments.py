@@ -111,6 +111,7 @@ def started(
     monkeypatch.setattr(module, "write_design", lambda *_: None)
     patched = type("Patched", (), {**vars(subprocess), "Popen": staticmethod(popen)})
     monkeypatch.setattr(module, "subprocess", patched)
+    beside.prepare()
     beside.start(FITTED)
     return beside, processes
 
@@ -122,6 +123,17 @@ def test_the_end_of_the_study_ends_them(folder: Path, monkeypatch: pytest.Monkey
     assert [process.poll() for process in processes] == [None, None]
     beside.stop()
     assert [process.poll() for process in processes] == [0, 0]
+
+
+@pytest.mark.long
+def test_a_study_that_ends_before_its_design_ends_the_prepared_processes(folder: Path) -> None:
+    beside = ChipExperiments(folder, builtin_study(), twin_of_reading("hz"), 1, True, "none")
+    beside.prepare()
+    processes = list(beside._processes.values())
+    assert beside.finish() == {}
+    beside.stop()
+    assert None not in [process.poll() for process in processes]
+    assert not (folder / "chip").exists() and not (folder / "miniature").exists()
 
 
 @pytest.mark.long

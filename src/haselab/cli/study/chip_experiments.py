@@ -1,6 +1,7 @@
 """Microcontroller experiments of the reference study (rows S26, S28), each in its own process.
 
-They start when the study has designed its controllers, and run in parallel with the rest of it.
+The processes load their modules while the study plays its first experiments. The experiments start
+when it has designed its controllers, and run in parallel with the rest of it.
 All their inputs are files in the run's folder, with which `haselab run` repeats them.
 """
 
@@ -22,6 +23,7 @@ from haselab.cli.study.chip_run import record_on_chip
 from haselab.control import LoopSetting, PidGains
 from haselab.control.feedthrough import with_feedthrough
 from haselab.firmware import FrontEnd
+from haselab.models.filters import lfilter
 from haselab.rig.chip import ChipFile, SupplyModel, read_design
 from haselab.rig.rig_file import load_rig
 from haselab.rig.twin.config import TwinConfig
@@ -50,6 +52,7 @@ from haselab.study.folder import write_design
 __all__ = ["ChipExperiments", "main"]
 
 _END_S = 10.0
+_GO = b"\n"
 _PLACE = EXPERIMENTS.parent
 
 
@@ -79,6 +82,18 @@ class ChipExperiments:
         self._processes: dict[str, subprocess.Popen[bytes]] = {}
         self._output: dict[str, IO[bytes]] = {}
         self._found: dict[type, object] = {}
+        self._started = False
+
+    def prepare(self) -> None:
+        """Start the processes, which load their modules and wait."""
+        for name in (CHIP, MINIATURE):
+            output = tempfile.TemporaryFile()  # noqa: SIM115 - closed by `stop`
+            self._output[name] = output
+            self._processes[name] = subprocess.Popen(
+                [sys.executable, "-m", __name__, str(self._folder), self._keep_video, name],
+                stdin=subprocess.PIPE, stdout=output, stderr=output,
+                process_group=0,  # Ctrl-C is for the study, whose end ends these
+            )  # fmt: skip
 
     def start(self, outcome: ExperimentResult) -> None:
         """Start the experiments as soon as all their inputs are known.
@@ -91,8 +106,9 @@ class ChipExperiments:
         self._found |= {type(value): value for value in outcome.values}
         maps, dynamics = self._found.get(Maps), self._found.get(Dynamics)
         loops = self._found.get(Loops)
-        if self._processes or not (maps and dynamics and loops):
+        if self._started or not (maps and dynamics and loops):
             return
+        self._started = True
         assert isinstance(maps, Maps) and isinstance(dynamics, Dynamics)
         assert isinstance(loops, Loops)
         write_design(self._folder, maps, dynamics, loops, self._study)
@@ -110,14 +126,11 @@ class ChipExperiments:
             },
         }
         write_text(place / "chip.toml", toml_text(rig))
-        for name in (CHIP, MINIATURE):
-            output = tempfile.TemporaryFile()  # noqa: SIM115 - closed by `stop`
-            self._output[name] = output
-            self._processes[name] = subprocess.Popen(
-                [sys.executable, "-m", __name__, str(self._folder), self._keep_video, name],
-                stdin=subprocess.PIPE, stdout=output, stderr=output,
-                process_group=0,  # Ctrl-C is for the study, whose end ends these
-            )  # fmt: skip
+        for process in self._processes.values():
+            assert process.stdin is not None
+            with contextlib.suppress(OSError):  # a process that has ended is reported by `finish`
+                process.stdin.write(_GO)
+                process.stdin.flush()
 
     def finish(self) -> Mapping[str, str]:
         """Wait for the end.
@@ -125,7 +138,7 @@ class ChipExperiments:
         Returns:
             Why an experiment was left out, by its row; the report states it, too.
         """
-        if not self._processes:
+        if not self._started:
             return {}
         parts = []
         for name, process in self._processes.items():
@@ -148,6 +161,8 @@ class ChipExperiments:
         """End the processes, whatever their state."""
         for process in self._processes.values():
             assert process.stdin is not None
+            if not self._started:
+                process.kill()  # it may still load its modules, and has opened nothing
             with contextlib.suppress(OSError):
                 process.stdin.close()  # at the end of its input, it ends
             try:
@@ -268,6 +283,9 @@ def _end_with_the_study() -> None:
 
 if __name__ == "__main__":
     lower_priority()  # the study, which takes longest, goes first
+    lfilter([1.0], [1.0], [0.0])  # loads scipy.signal, which the experiments need
     gc.freeze()  # the garbage collector need not look at the modules again
+    if os.read(0, len(_GO)) != _GO:  # the study has ended without the experiments
+        sys.exit(1)
     threading.Thread(target=_end_with_the_study, daemon=True).start()
     main(Path(sys.argv[1]), sys.argv[2], sys.argv[3])

@@ -78,6 +78,9 @@ physical_model_option = shared_option(
 class ParallelExperiments(Protocol):
     """Experiments of a study that run on another bench at the same time."""
 
+    def prepare(self) -> None:
+        """Start what needs no result of the study."""
+
     def start(self, outcome: ExperimentResult) -> None:
         """Take the outcome of a fit; start once all that the experiments need is known."""
 
@@ -184,6 +187,8 @@ def _execute(
     try:
         if noise_free_run is not None:
             running.enter_context(noise_free_run)
+        if parallel is not None:
+            parallel.prepare()
         found = run_study(study, rig, options, progress, fitted)
         model = None
         by_model: Findings | str = NOT_HERE

@@ -136,7 +136,8 @@ class BlockWatch:
         )
 
     def _pinned(self, current: NDArray[np.int16]) -> str:
-        if max(int(current.max()), -int(current.min())) < _END_CODE:
+        lowest, highest = np.minimum.reduce(current), np.maximum.reduce(current)
+        if max(int(highest), -int(lowest)) < _END_CODE:
             return ""
         pinned = int(np.count_nonzero((current >= _END_CODE) | (current <= -_END_CODE)))
         if pinned <= _PINNED_S * self._rig.rate_hz:
@@ -153,7 +154,7 @@ class BlockWatch:
             return None
         spread_v = self._tolerance_v + _PEAKING * self._carrier_v
         low, high = (low_v - spread_v) * self._code_per_v, (high_v + spread_v) * self._code_per_v
-        if low <= int(volt.min()) and int(volt.max()) <= high:
+        if low <= int(np.minimum.reduce(volt)) and int(np.maximum.reduce(volt)) <= high:
             return None
         outside = (volt < low) | (volt > high)
         if np.count_nonzero(outside) <= _GLITCHES * volt.size:

@@ -296,7 +296,7 @@ class Delay:
         if not self._counted:
             return ""
         level = codes[self._model.level, 0]
-        self._level.append(float(level.sum(dtype=np.int64)) / level.size)
+        self._level.append(float(np.add.reduce(level, dtype=np.int64)) / level.size)
         self._drive.append(drive_v * self._model.code_per_v)
         self._count += 1
         if self._count % _LAG_EVERY or len(self._drive) < (self._drive.maxlen or 0):

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from bisect import bisect_right
 from collections import deque
 from dataclasses import dataclass
 
@@ -95,6 +96,10 @@ class LoopWatchdog:
         settled: bool = True,
     ) -> None:
         self._model, self._settings, self._rating = model, settings, rating
+        self._map: tuple[list[float], list[float]] = (
+            model.map_drive_v.tolist(),
+            model.map_strain.tolist(),
+        )
         self._plausible = Plausible(model, settings)
         self._blocks = _blocks(model.block_s, settings)
         self._strains = Repeats(
@@ -169,7 +174,12 @@ class LoopWatchdog:
     def _static(self, drive_v: float) -> float:
         """Static strain of a drive, by the voltage map."""
         acting_v = abs(drive_v) if self._model.alternates else drive_v
-        return float(np.interp(acting_v, self._model.map_drive_v, self._model.map_strain))
+        volts, strains = self._map  # np.interp would let another thread run, and wait for it
+        if not volts[0] <= acting_v < volts[-1]:
+            return math.nan if math.isnan(acting_v) else strains[0 if acting_v < volts[0] else -1]
+        k = bisect_right(volts, acting_v) - 1
+        slope = (strains[k + 1] - strains[k]) / (volts[k + 1] - volts[k])
+        return slope * (acting_v - volts[k]) + strains[k]
 
     def _gaps(self) -> str:
         lost, window = sum(self._lost), self._lost.maxlen or 1

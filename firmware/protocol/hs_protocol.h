@@ -50,15 +50,15 @@
 #define HP_FAULT_NOT_FINITE 5u /* the drive was NaN or outside its limits: memory was damaged */
 #define HP_FAULT_WATCHDOG 6u /* the watchdog reset the microcontroller */
 #define HP_FAULT_BROWN_OUT 7u /* the supply dipped */
-#define HP_FAULT_WRONG_OUTPUT 9u /* the high voltage differs from the requested one */
 #define HP_FAULT_LOST_STATE 8u /* the state machine's memory was damaged */
+#define HP_FAULT_WRONG_OUTPUT 9u /* the high voltage differs from the requested one */
 
 /* Bits that the sampling interrupt sets. */
 #define HP_ALARM_RAIL 1u /* a monitor at the end of its range, or the level collapsed, while enabled */
 #define HP_ALARM_LOST_SAMPLE 2u /* a conversion was lost or late */
 #define HP_ALARM_LATE 4u /* updates are not completed */
 
-/* Why there is no strain: bits 1, 2 and 4 as in core/include/hs.h, others of the firmware. */
+/* Why there is no strain: 1, 2 and 4 are from core/include/hs.h, others from the firmware. */
 #define HP_REASON_AMPLITUDE_LOST 1u /* no carrier on one of the monitors */
 #define HP_REASON_PHASE_OUT 2u /* the phase is not that of a capacitor */
 #define HP_REASON_CLIPPED 4u /* a sample at the end of the converter's range */

@@ -55,8 +55,8 @@ class Fault(IntEnum):
     NOT_FINITE = 5  # the drive was NaN or outside its limits: memory was damaged
     WATCHDOG = 6  # the watchdog reset the microcontroller
     BROWN_OUT = 7  # the supply dipped
-    WRONG_OUTPUT = 9  # the high voltage differs from the requested one
     LOST_STATE = 8  # the state machine's memory was damaged
+    WRONG_OUTPUT = 9  # the high voltage differs from the requested one
 
 
 class Alarm(IntFlag):
@@ -68,7 +68,7 @@ class Alarm(IntFlag):
 
 
 class Reason(IntFlag):
-    """Why there is no strain: bits 1, 2 and 4 as in core/include/hs.h, others of the firmware."""
+    """Why there is no strain: 1, 2 and 4 are from core/include/hs.h, others from the firmware."""
 
     AMPLITUDE_LOST = 1  # no carrier on one of the monitors
     PHASE_OUT = 2  # the phase is not that of a capacitor

@@ -128,7 +128,7 @@ def test_a_report_is_shown_in_the_page_with_stop_and_runs_no_script(
         "<script>parent.wrong = 1</script><h1 onclick='parent.wrong = 1'>Results of a</h1>"
         "<a href='#end'>to the end</a><p id='end'>The end</p>"
     )
-    page.get_by_role("button", name="Report").click()
+    page.get_by_role("button", name="Report", exact=True).click()
     heading = page.frame_locator("iframe").get_by_role("heading", name="Results of a")
     heading.click()
     page.frame_locator("iframe").get_by_role("link").click()
@@ -148,7 +148,7 @@ def test_a_report_that_leads_elsewhere_gives_the_keys_back(page: Page, tmp_path:
         "<a href='http://127.0.0.1:9/'>to another page</a>"
     )
     for _ in range(2):  # it can be opened again
-        page.get_by_role("button", name="Report").click()
+        page.get_by_role("button", name="Report", exact=True).click()
         report = page.frame_locator("iframe")
         expect(report.get_by_role("heading", name="Results of a")).to_be_visible(timeout=WAIT_MS)
         expect(report.locator("iframe, select")).to_have_count(0)  # they would take the keys
@@ -163,7 +163,7 @@ def test_a_report_that_leads_elsewhere_gives_the_keys_back(page: Page, tmp_path:
 
 def test_a_report_that_would_keep_stop_waiting_is_not_shown(page: Page, tmp_path: Path) -> None:
     (tmp_path / "a" / "report.html").write_text("<p>" + 11_000_000 * "a")
-    page.get_by_role("button", name="Report").click()
+    page.get_by_role("button", name="Report", exact=True).click()
     expect(page.get_by_text("at most 10 MB")).to_be_visible(timeout=WAIT_MS)
     expect(page.locator("iframe")).to_have_count(0)
 

@@ -57,5 +57,5 @@ def test_the_step_ends_at_the_reference_within_the_limits(design: hl.Design) -> 
 def test_a_design_can_be_plotted(design: hl.Design) -> None:
     figure = design.plot()
     assert [axes.get_ylabel() for axes in figure.axes] == [
-        "Output", "Controller", "Magnitude", "Phase (°)",
+        "Output", "Controller", "Magnitude (1)", "Phase (°)",
     ]  # fmt: skip

@@ -22,7 +22,7 @@ from haselab.study.definition import load_study
 PAGE = Path(__file__).resolve().parents[2] / "docs" / "your-actuator.md"
 TEXT = PAGE.read_text(encoding="utf-8")
 COMMANDS = re.findall(r"^```\n(.*?)^```$", TEXT, flags=re.DOTALL | re.MULTILINE)[0].splitlines()
-FOREIGN, RECORDED = (
+FOREIGN, _, RECORDED = (
     block.splitlines()
     for block in re.findall(r"^```sh\n(.*?)^```$", TEXT, flags=re.DOTALL | re.MULTILINE)
 )

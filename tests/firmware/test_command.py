@@ -18,6 +18,7 @@ from haselab.firmware import ChipSettings, FrontEnd, settings_header
 from haselab.models.maps import VoltageMap
 from haselab.rig.chip import ChipFile, Firmware, find_tool, read_design
 from haselab.rig.chip.design import strains_within
+from haselab.rig.chip.opening import FrontEndConfig
 from haselab.rig.rig_file import load_rig
 from haselab.rig.twin.config import twin_of_reading
 from haselab.study.chip.loops import SLOW, StepPlan, desktop_loop
@@ -140,6 +141,7 @@ def test_a_twin_with_another_capacitance_is_refused_before_anything_is_built(
     # 14 and 419 pF: the record of 149 to 284 pF, and its width on either side
     assert "The actuator of the twin has 474 pF at 0 V" in err
     assert "accepts 14 to 419 pF" in err and "--twin TWIN.toml" in err
+    assert "haselab identify actuator RECORDS --actuator A.toml" in err
 
 
 def test_a_capacitance_that_saturates_the_converter_is_refused_with_the_gain_that_it_needs(
@@ -180,6 +182,39 @@ def test_a_module_whose_gain_differs_from_that_of_the_records_is_refused(
     found, _, err = run(capsys, "firmware", "build", path, "--build-dir", tmp_path / "fw", *which)
     assert found == code, err
     assert ("it would put out 5 times the high voltage of the records" in err) == (code == 2)
+    assert ("as gain in [front_end]" in err and "firmware.md" in err) == (code == 2)
+
+
+def test_simulate_refuses_the_same_gain_as_build(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    path = tmp_path / "small.toml"
+    path.write_text(SMALL.replace("[drive]", "[drive]\ngain_v_per_v = 4000.0"))
+    code, _, err = run(capsys, "firmware", "simulate", path)
+    assert code == 2 and "it would put out 1.25 times the high voltage of the records" in err
+    assert "'firmware simulate' cannot simulate it" in err
+
+
+def test_the_rig_file_of_the_page_builds_for_another_gain(
+    firmware: Firmware, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """Its keys are all those of the file, with their defaults."""
+    page = (Path(__file__).resolve().parents[2] / "docs/control/firmware.md").read_text("utf-8")
+    part = page.split("### The rig file of a microcontroller")[1]
+    (tmp_path / "chip.toml").write_text(part.split("```toml\n")[1].split("```")[0])
+    (tmp_path / "actuator.toml").write_text(
+        SMALL.replace("[drive]", "[drive]\ngain_v_per_v = 4000.0")
+    )
+    code, _, err = run(capsys, "firmware", "build", tmp_path / "actuator.toml", "--rig",
+                       tmp_path / "chip.toml", "--build-dir", tmp_path / "fw")  # fmt: skip
+    assert code == 0, err
+    table = part.split("| key of `[front_end]`")[1].split("\n\n")[0]
+    for name, field in FrontEndConfig.model_fields.items():
+        row = next(line for line in table.splitlines() if line.startswith(f"| `{name}` |"))
+        stated = row.split("|")[3].strip().strip("`")
+        assert stated == (
+            str(list(field.default)) if name == "correction" else f"{field.default:g}"
+        )
 
 
 @pytest.mark.long

@@ -44,12 +44,14 @@ def gain_label(quantity: str, source: str, output: str) -> str:
     Example:
         >>> gain_label("Magnitude", "u (V)", "y (m)"), gain_label("Magnitude", "u (V)", "strain")
         ('Magnitude (m/V)', 'Magnitude (1/V)')
-        >>> gain_label("Magnitude", "u", "y (m)")
-        'Magnitude'
+        >>> gain_label("Magnitude", "u", "y (m)"), gain_label("Magnitude", "strain", "strain")
+        ('Magnitude', 'Magnitude (1)')
     """
     units = [_unit(source), _unit(output)]
-    if "" in units or units[0] == units[1]:
+    if "" in units:
         return quantity
+    if units[0] == units[1]:
+        return f"{quantity} (1)" if units[0] == "1" else f"{quantity} ({units[1]}/{units[0]})"
     return f"{quantity} ({units[1]})" if units[0] == "1" else f"{quantity} ({units[1]}/{units[0]})"
 
 

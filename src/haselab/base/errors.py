@@ -1,5 +1,7 @@
 """The error classes. A message says what is wrong, the value found and what to do."""
 
+import re
+
 from haselab.base.exits import no_exit
 
 __all__ = [
@@ -10,8 +12,12 @@ __all__ = [
     "ResultError",
     "SafetyError",
     "described",
+    "named_files",
     "text_of",
 ]
+
+# Words after the last full stop that are no sentence: names of files, which end in no full stop.
+_BARE_FILES = re.compile(r"(?<=[.!?]) (\S*[^\s.!?]|\S*[./]\S*[^\s.!?](?: \S*[./]\S*[^\s.!?])+)$")
 
 
 class HaselabError(Exception):
@@ -44,6 +50,22 @@ class DeviceError(HaselabError, OSError):
 
 class SafetyError(DeviceError):
     """A protection tripped; the output was commanded to 0 V."""
+
+
+def named_files(message: str) -> str:
+    """Write "File:" before the names of files that stand alone at the end of a message.
+
+    Args:
+        message: one line.
+    Example:
+        >>> named_files("The column is constant. Name another one. data/a.csv")
+        'The column is constant. Name another one. File: data/a.csv'
+        >>> named_files("Not rising. a.csv b.csv"), named_files("Use a rate above 0 Hz: a.csv")
+        ('Not rising. Files: a.csv b.csv', 'Use a rate above 0 Hz: a.csv')
+    """
+    return _BARE_FILES.sub(
+        lambda found: f" File{'s' if ' ' in found[1] else ''}: {found[1]}", message
+    )
 
 
 def text_of(error: BaseException) -> str:

@@ -30,10 +30,12 @@ __all__ = [
     "check_unit",
     "column_option",
     "column_options",
+    "drive_of",
     "note_conversions",
     "note_seconds",
     "note_units",
     "options_of_each",
+    "refuse_beyond_drive",
     "refuse_other_sign",
     "strains_of",
 ]
@@ -43,6 +45,10 @@ _LARGE_STRAIN = 1.0  # twice the length: without a unit, it is more likely per c
 _FAR = 10.0  # times a known strain; per cent are 100 times
 _LENGTHS = 0.5, 3.0  # of actuators, over the length at strain 0
 _NEAREST_ZERO = 0.3  # smallest displacement, over the length at strain 0
+_BESIDE = 0.05  # of the drive's range: offset and noise of a recorded drive
+_OFTEN = 0.01  # share of the samples beyond it that are no noise
+_FAR_BEYOND = 0.5  # of the drive's range, which no noise reaches
+_FEWEST = 3  # samples; fewer are spikes
 
 
 @dataclass(frozen=True)
@@ -258,9 +264,91 @@ def strains_of(
     low, high = float(np.nanmin(strain)), float(np.nanmax(strain))
     click.echo(
         f"haselab: strain = {what} ({low:.3g} to {high:.3g}), with zero_length_m = {zero_m:g} m of "
-        f"the actuator file. {file}", err=True,
+        f"the actuator file. File: {file}", err=True,
     )  # fmt: skip
     return np.asarray(strain)
+
+
+def drive_of(
+    column: str,
+    values_v: NDArray[np.float64],
+    file: Path,
+    known: ActuatorTables | None,
+    volt_per_monitor_volt: float | None = None,
+) -> NDArray[np.float64]:
+    """Drive before the amplifier of a column of voltages: as it is, or from a voltage monitor.
+
+    Args:
+        column: name of it.
+        values_v: shape `(N,)`.
+        file: of the column.
+        known: the actuator's file, with the limits of the drive and the gain of the amplifier.
+        volt_per_monitor_volt: V at the actuator for each V of the column; None: it is the drive.
+    Returns:
+        Shape `(N,)`.
+    Raises:
+        InputError: a drive beyond the limits; a monitor without the gain of the amplifier.
+    """
+    if volt_per_monitor_volt is None:
+        refuse_beyond_drive(column, values_v, file, known)
+        return values_v
+    gain = None if known is None else known.drive.gain_v_per_v
+    if gain is None:
+        raise InputError(
+            "--volt-per-monitor-volt needs the gain of the amplifier, to convert the monitor to the"
+            " drive. State gain_v_per_v in [drive] of an actuator file, and add --actuator FILE: "
+            f"{file}"
+        )
+    drive_v = values_v * (volt_per_monitor_volt / gain)
+    refuse_beyond_drive(column, drive_v, file, known, what=f"Column {column}, as the drive,")
+    click.echo(
+        f"haselab: drive = {column} * {volt_per_monitor_volt:g} / {gain:g} "
+        f"({float(np.nanmin(drive_v)):.3g} to {float(np.nanmax(drive_v)):.3g} V), with "
+        f"gain_v_per_v = {gain:g} of the actuator file. File: {file}", err=True,
+    )  # fmt: skip
+    return drive_v
+
+
+def refuse_beyond_drive(
+    column: str,
+    drive_v: NDArray[np.float64],
+    file: Path,
+    known: ActuatorTables | None,
+    *,
+    what: str = "",
+    scale: str = "--volt-per-monitor-volt S",
+) -> None:
+    """Refuse a recorded drive outside the limits of the actuator: it is in another unit.
+
+    Offsets, noise and spikes are allowed: at most 1 % of the samples may be beyond the limits by
+    more than 5 % of their range, and at most two by more than half of it.
+
+    Args:
+        column: name of it.
+        drive_v: its values as the drive before the amplifier. Shape `(N,)`.
+        file: of the column.
+        known: the actuator's file; without `high_v`, nothing is compared.
+        what: start of the message; empty: the column.
+        scale: the option that states the scale of a monitor.
+    Raises:
+        InputError: it is outside.
+    """
+    if known is None or known.drive.high_v is None:
+        return
+    high_v = known.drive.high_v
+    low_v = -abs(high_v) if known.drive.low_v is None else known.drive.low_v
+    beyond = np.maximum(drive_v - high_v, low_v - drive_v) / (high_v - low_v)
+    often = np.count_nonzero(beyond > _BESIDE) > max(_OFTEN * beyond.size, _FEWEST - 1)
+    if not often and np.count_nonzero(beyond > _FAR_BEYOND) < _FEWEST:
+        return
+    raise InputError(
+        f"{what or f'Column {column}'} is from {float(np.nanmin(drive_v)):.4g} to "
+        f"{float(np.nanmax(drive_v)):.4g} V, but low_v and high_v in [drive] of the actuator file "
+        f"permit {low_v:g} to {high_v:g} V before the amplifier. If the column is a voltage "
+        f"monitor, state {scale}: the V at the actuator for each V of the column (1000 for a "
+        "monitor of 1 V/kV, 1 for the voltage at the actuator). If its unit is another one, add "
+        f"--unit '{column}=mV'. If the drive may be that high, correct low_v and high_v: {file}"
+    )
 
 
 def _are_lengths(least_m: float, largest_m: float, zero_m: float) -> bool:
@@ -317,7 +405,7 @@ def note_seconds(name: str, file: Path) -> None:
     """Say on stderr that a column of times is taken as seconds."""
     click.echo(
         f"haselab: column {name} states no unit: its values are taken as times in seconds. State "
-        f"another one with --unit {name}=ms. {file}",
+        f"another one with --unit {name}=ms. File: {file}",
         err=True,
     )
 
@@ -339,5 +427,7 @@ def note_conversions(units: Mapping[str, Unit | None], file: Path) -> None:
     for name, unit in units.items():
         if unit is not None and unit.factor != 1.0:
             to = "a pure number" if unit.si == "1" else unit.si
-            click.echo(f"haselab: column {name} was converted from {unit.symbol} to {to}. {file}",
-                       err=True)  # fmt: skip
+            click.echo(
+                f"haselab: column {name} was converted from {unit.symbol} to {to}. File: {file}",
+                err=True,
+            )

@@ -170,7 +170,7 @@ def unverified_option(function: F) -> F:
 def warn_unverified(doubt: str, path: Path) -> None:
     """Warn in one line that the numbers of a session are not verified, and why."""
     if doubt:
-        click.echo(f"haselab: unverified numbers: {doubt}. {path}", err=True)
+        click.echo(f"haselab: unverified numbers: {doubt}. File: {path}", err=True)
 
 
 def emit(
@@ -180,6 +180,7 @@ def emit(
     out: Path | None,
     shorter: Mapping[str, Any] | None = None,
     units: Mapping[str, str] | None = None,
+    shown: Mapping[str, Any] | None = None,
 ) -> None:
     """Print an answer (JSON or readable lines) and, if `out` is given, write its JSON there.
 
@@ -189,6 +190,7 @@ def emit(
         out: file of the JSON.
         shorter: what the readable lines have in place of long parts of the answer.
         units: by name, of numbers whose unit is neither in their name nor in the answer.
+        shown: what the readable lines have in place of the whole answer.
     """
     text = json.dumps(to_plain(answer), indent=2)
     if out is not None:
@@ -196,7 +198,8 @@ def emit(
     if as_json:
         click.echo(text)
     else:
-        click.echo("\n".join(readable({**answer, **(shorter or {})}, units)))
+        lines = {**answer, **(shorter or {})} if shown is None else shown
+        click.echo("\n".join(readable(lines, units)))
 
 
 class _BarProgress:

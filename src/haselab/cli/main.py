@@ -14,7 +14,7 @@ from typing import Any, TextIO
 
 import click
 
-from haselab.base.errors import HaselabError, described, text_of
+from haselab.base.errors import HaselabError, described, named_files, text_of
 from haselab.base.exits import SignalExit, exit_code_text
 from haselab.base.foreign_code import foreign_failure, packages_of_threads
 from haselab.cli.bench.revoke_first import revoke_first
@@ -121,7 +121,7 @@ def cli() -> None:
 
 
 def _fail(message: str, exit_code: int) -> int:
-    line = " ".join(message.split())
+    line = named_files(" ".join(message.split()))
     if len(line) > _MOST_CHARACTERS:  # it quotes a damaged file; both ends say what to do
         line = f"{line[: _MOST_CHARACTERS // 2]} … {line[-_MOST_CHARACTERS // 2 :]}"
     try:

@@ -43,8 +43,8 @@ def loop_chart(
     hz, one = omega / (2.0 * np.pi), np.ones(_POINTS)
     axis = "Frequency (Hz)"
     return Chart("Open loop with its delay", (
-        Panel(axis, "Magnitude", (Curve(hz, np.abs(response)), Curve(hz, one, "crossover at 1")),
-              log_x=True, log_y=True),
+        Panel(axis, "Magnitude (1)", (Curve(hz, np.abs(response)),
+                                      Curve(hz, one, "crossover at 1")), log_x=True, log_y=True),
         Panel(axis, "Phase (°)", (Curve(hz, np.degrees(np.unwrap(np.angle(response)))),
                                   Curve(hz, -180.0 * one, "-180°")), log_x=True),
     ))  # fmt: skip

@@ -69,7 +69,7 @@ def test_a_fault_is_named_with_what_to_do_and_the_protocol_holds_it(tmp_path, ca
         "the voltage monitor has the wrong sign. First switch the amplifier and the "
         "supply off and discharge the electrodes. Swap the two wires of the voltage monitor at "
         "the board. Then run "
-        f"'haselab rig check' again. {path}"
+        f"'haselab rig check' again. File: {path}"
     )
     assert "recommended for the rig file" not in out  # the file has what was measured
     printed = json.loads(save.read_text())

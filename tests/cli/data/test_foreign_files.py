@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import codecs
 import json
+import tomllib
 from collections.abc import Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -508,7 +509,7 @@ def test_sense_says_which_columns_it_converted(tmp_path, capsys):
     asked = ("--v", "U", "--i", "I", "--carrier-hz", 2000, "--rate-hz", RATE_HZ)
     assert code_of("sense", path, *asked) == 0
     error = capsys.readouterr().err
-    assert f"haselab: column U was converted from mV to V. {path}\n" in error
+    assert f"haselab: column U was converted from mV to V. File: {path}\n" in error
     assert "column I" not in error
 
 
@@ -538,8 +539,15 @@ def test_a_capacitance_map_shows_one_slope(tmp_path, capsys):
     low, high = (written := answer_of(capsys, *asked)["strain_map"])["band"]
     # Noise of 2e-13 F over 1e-9 F per unit of strain: 2e-4, of which 1.96 are the band.
     assert -low == pytest.approx(3.9e-4, rel=0.25) and high == pytest.approx(3.9e-4, rel=0.25)
-    assert (
-        f"map for loops: 95 % of strains within {low:+.2g} to {high:+.2g} of it; written to "
-        "[sensing.strain_map]"
-    ) in shown
-    assert "slope_per_f" in written
+    assert f"95 % of strains within {low:+.2g} to {high:+.2g} of it" in shown
+    assert shown.index("[sensing.strain_map], written") < shown.index("line, not written")
+    # The coefficients on the screen are those of the file, also for a curved map.
+    for curve in (0.0, 3.0):
+        farad = 5e-10 * (1.0 + 2.0 * strain + curve * strain**2) + noise
+        path.write_text("strain,capacitance_f\n" + rows(strain, farad))
+        assert code_of(*asked) == 0
+        shown = capsys.readouterr().out
+        written = tomllib.loads(actuator.read_text())["sensing"]["strain_map"]
+        for name in ("slope_per_f", "offset", "curvature_per_f2", "cubic_per_f3"):
+            found = [line.split()[1] for line in shown.splitlines() if line.split()[:1] == [name]]
+            assert found == ([f"{written[name]:.6g}"] if name in written else [])

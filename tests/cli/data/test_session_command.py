@@ -128,7 +128,7 @@ def test_the_drive_is_imported_block_by_block_and_times_without_a_unit_are_named
     assert stop.value.code == 0, err
     assert err == (
         "haselab: column t states no unit: its values are taken as times in seconds. State "
-        f"another one with --unit t=ms. {tmp_path / 'm.csv'}\n"
+        f"another one with --unit t=ms. File: {tmp_path / 'm.csv'}\n"
     )
     with SessionReader(tmp_path / "o" / "session.h5") as session:
         record = session.experiment("imported")

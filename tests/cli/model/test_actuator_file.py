@@ -524,7 +524,7 @@ def test_a_ragged_covariance_of_a_map_is_one_line(files, tmp_path, capsys, secti
     code, _, error = run(capsys, "report", actuator, "--out", tmp_path / "page.html")
     assert code == 2 and error == (
         f"haselab: 1 error: {section}.covariance: must be 4 rows of 4 numbers, not rows "
-        f"of {rows}. Change these values. {actuator}\n"
+        f"of {rows}. Change these values. File: {actuator}\n"
     )
 
 

@@ -62,7 +62,7 @@ def test_a_physical_model_with_an_error_gives_a_warning(tmp_path, capsys):
     file.write_text(FILE + 'status = "model error: lengths are off"\n')
     code, _, err = run(capsys, "design", file, "--controller", "force", "--delay-s", 0.0056)
     said = "the status of [model.physical], which the design uses, is: model error: lengths are off"
-    assert code == 0 and err == f"haselab: warning: {said}. {file}\n"
+    assert code == 0 and err == f"haselab: warning: {said}. File: {file}\n"
 
 
 CURLING = """

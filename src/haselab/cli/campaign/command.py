@@ -147,7 +147,7 @@ def command(
             if not comparison and not pairs:
                 click.echo(
                     f"haselab: No comparison: no result has at least {LEAST_CASES} values and a "
-                    f"finite median in both campaigns. {other}", err=True,
+                    f"finite median in both campaigns. File: {other}", err=True,
                 )  # fmt: skip
             for doubt in doubts:
                 click.echo(f"haselab: warning: the campaign in {other}: {doubt}", err=True)

@@ -205,7 +205,7 @@ def _warn_of_stated(
             listed = ", ".join(f"{value:g}" for value in dict.fromkeys(found))
             click.echo(
                 f"haselab: warning: {name} is {stated:g} {unit}, but the sessions state {listed} "
-                f"{unit}. The fit uses the sessions. Correct the wrong value. {path}",
+                f"{unit}. The fit uses the sessions. Correct the wrong value. File: {path}",
                 err=True,
             )
 
@@ -275,7 +275,7 @@ def _note_assumed(law: ActuatorLaw, section: ActuatorSection | None, path: Path)
         values = ", ".join(f"{name} = {value:g}" for name, value in assumed.items())
         click.echo(
             f"haselab: defaults of the kind {law.kind}, which are not fitted: {values}. State what "
-            f"you measured in [actuator.parameters]. {path}",
+            f"you measured in [actuator.parameters]. File: {path}",
             err=True,
         )
 

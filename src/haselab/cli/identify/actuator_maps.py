@@ -206,7 +206,7 @@ def save_strain_map(actuator: Path, pairs: Pairs, files: Sequence[Path]) -> Mapp
         )
         click.echo(
             f"haselab: the map is limited to {1e12 * low_f:.4g} to {1e12 * high_f:.4g} pF of "
-            f"{1e12 * c.min():.4g} to {1e12 * c.max():.4g} pF: {why}. {files[0]}",
+            f"{1e12 * c.min():.4g} to {1e12 * c.max():.4g} pF: {why}. File: {files[0]}",
             err=True,
         )
     section = strain_map_section(found)

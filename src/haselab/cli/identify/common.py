@@ -20,10 +20,11 @@ from haselab.cli.columns import (
     advice_on_columns,
     check_strain,
     check_unit,
+    drive_of,
     note_units,
     strains_of,
 )
-from haselab.cli.common import REAL, emit
+from haselab.cli.common import POSITIVE, REAL, emit
 from haselab.cli.options import shared_option
 from haselab.identify.record import Record
 from haselab.identify.statics.columns import plausible_strain, plausible_voltage
@@ -40,6 +41,7 @@ __all__ = [
     "FILES",
     "INPUT",
     "LOAD",
+    "MONITOR_SCALE",
     "OUTPUT",
     "RATE",
     "STRAIN",
@@ -68,6 +70,12 @@ FILES = click.argument("files", nargs=-1, required=True, type=click.Path(path_ty
 RATE = shared_option("--rate-hz", type=REAL, detail="Default: the rate in the file.")
 INPUT = shared_option("--input", "source", default="u", show_default=True)
 OUTPUT = shared_option("--output", default="y", show_default=True)
+
+MONITOR_SCALE = shared_option(
+    "--volt-per-monitor-volt", type=POSITIVE,
+    detail="The column is then this monitor, and the drive is the column times this scale, divided "
+    "by gain_v_per_v of the actuator file. Default: the column is the drive.",
+)  # fmt: skip
 
 _SHORTER = {  # parts of an answer that nobody reads on the screen
     "covariance": "of all parameters (use --json or --out)",
@@ -113,10 +121,12 @@ def emit_fit(
     more: Mapping[str, Any] | None = None,
     shorter: Mapping[str, Any] | None = None,
     units: Mapping[str, str] | None = None,
+    shown: Mapping[str, Any] | None = None,
 ) -> None:
     """Print the answer and the keys `more`; without a result, end the command with code 3.
 
-    The readable lines have `shorter` in place of long parts of the answer, and `units`, by name.
+    The readable lines have `shorter` in place of long parts of the answer, and `units`, by name;
+    or `shown` in place of all of it.
     """
     if not fit.succeeded:
         listed = " ".join(str(file) for file in files)
@@ -124,8 +134,9 @@ def emit_fit(
             emit(fit.answer(), as_json=True, out=out)
         raise ResultError(f"{fit.status}: {listed}")
     answer = {**fit.answer(), **(more or {})}
-    shown = {name: text for name, text in _SHORTER.items() if answer.get(name) is not None}
-    emit(answer, as_json=as_json, out=out, shorter={**shown, **(shorter or {})}, units=units)
+    stored = {name: text for name, text in _SHORTER.items() if answer.get(name) is not None}
+    shorter = {**stored, **(shorter or {})}
+    emit(answer, as_json=as_json, out=out, shorter=shorter, units=units, shown=shown)
 
 
 @contextmanager
@@ -210,6 +221,8 @@ def read_recorded(
     hold: str | None = None,
     through: Path | None = None,
     to_strain: bool = True,
+    drive_of_file: Path | None = None,
+    volt_per_monitor_volt: float | None = None,
 ) -> Recorded:
     """Read the records of a file.
 
@@ -223,14 +236,30 @@ def read_recorded(
         through: actuator file whose voltage map converts the input from V to strain.
         to_strain: with `through`, also convert an output in m to strain if the file has the length
             at strain 0.
+        drive_of_file: actuator file with the limits of the drive, which an input in V is compared
+            with; None: `through`.
+        volt_per_monitor_volt: V at the actuator for each V of the input, which is then a monitor.
     Returns:
         The records.
     Raises:
-        InputError: no sampling rate, or no usable data.
+        InputError: no sampling rate, no usable data, or a drive beyond the limits.
         LimitError: a voltage outside the voltage map.
     """
     table = read_columns(file, names, columns)
     units = (_unit(table, names[0]), _unit(table, names[1]))
+    limits = drive_of_file or through
+    voltage = units[0] == "V" or through is not None or volt_per_monitor_volt is not None
+    if units[0] in ("", "V") and voltage and limits is not None:
+        drive_v = drive_of(
+            names[0], table[names[0]], file, load_actuator(limits), volt_per_monitor_volt
+        )
+        table = replace(table, columns={**table.columns, names[0]: drive_v})
+        units = "V", units[1]
+    elif volt_per_monitor_volt is not None:
+        raise InputError(
+            f"--volt-per-monitor-volt is for a monitor in V, but column {names[0]} is "
+            f"{unit_text(units[0])}. Leave out the option, or name another column: {file}"
+        )
     if through is not None:
         if units[0] not in ("", "V"):
             raise InputError(
@@ -276,7 +305,7 @@ def axis_names(source: str, output: str, units: tuple[str, str] | Table) -> tupl
     if isinstance(units, Table):
         units = (_unit(units, source), _unit(units, output))
     first, second = (
-        "Strain" if name == "strain" else name if unit in ("", "1") else f"{name} ({unit})"
+        "Strain" if name == "strain" else f"{name} ({unit})" if unit else name
         for name, unit in zip((source, output), units, strict=True)
     )
     return first, second
@@ -327,7 +356,8 @@ def read_valid(
     note_units(table, file)
     if table.left_out:
         click.echo(
-            f"haselab: left out {table.left_out} rows with 0 in column valid. {file}", err=True
+            f"haselab: left out {table.left_out} rows with 0 in column valid. File: {file}",
+            err=True,
         )
     return table
 

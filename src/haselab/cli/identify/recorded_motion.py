@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from haselab.base import InputError
-from haselab.cli.columns import Quantity, check_strain
+from haselab.cli.columns import Quantity, check_strain, refuse_beyond_drive
 from haselab.cli.common import warn_unverified
 from haselab.cli.identify.common import rate_hz_of, read_valid, unit_text
 from haselab.identify.physical import MotionRecord
@@ -132,7 +132,7 @@ def _warn_of_kind(recorded: str, stated: str, file: Path) -> None:
     if recorded != stated:
         click.echo(
             f"haselab: warning: the rig of this session states a {recorded}, but [actuator] kind "
-            f"is {stated}. {file}",
+            f"is {stated}. File: {file}",
             err=True,
         )
 
@@ -167,6 +167,9 @@ def _table(
             "--gain-v-per-v (1 if the column is the voltage of the actuator), or add gain_v_per_v "
             f"to [drive]. {file}"
         )
+    if known.drive.gain_v_per_v is not None:
+        drive_v = table[source] * (gain_v_per_v / known.drive.gain_v_per_v)
+        refuse_beyond_drive(source, drive_v, file, known, scale="--gain-v-per-v S")
     measured: dict[str, Floats] = {}
     for output in outputs:
         if np.isnan(table[output]).all():
@@ -208,7 +211,7 @@ def _warn_of_gaps(time_s: Floats, file: Path) -> None:
             f"haselab: warning: {long.sum()} steps of the times are longer than the usual "
             f"{np.median(steps_s):g} s, the longest is {steps_s[at]:g} s, after row {at + 1}. The "
             "voltage before a step is assumed to act until its end. If the voltage changed, add "
-            f"these rows with it; what was not measured may be empty (nan). {file}",
+            f"these rows with it; what was not measured may be empty (nan). File: {file}",
             err=True,
         )
 

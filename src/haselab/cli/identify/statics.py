@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 
 from haselab.base import Estimate, InputError
 from haselab.cli.actuator_file import load_actuator
-from haselab.cli.columns import column_option, column_options
+from haselab.cli.columns import column_option, column_options, drive_of
 from haselab.cli.common import INTEGER, REAL, actuator_option, answer_options
 from haselab.cli.identify.actuator_maps import read_pairs, save_strain_map, save_voltage_map
 from haselab.cli.identify.common import (
@@ -21,6 +21,7 @@ from haselab.cli.identify.common import (
     FILE,
     FILES,
     LOAD,
+    MONITOR_SCALE,
     STRAIN,
     STRESS,
     STRETCH,
@@ -239,6 +240,7 @@ def regions(
 @FILE
 @column_option(STRAIN)
 @column_option(VOLTAGE)
+@MONITOR_SCALE
 @column_options
 @actuator_option("The command writes [drive.voltage_map].")
 @answer_options(plot=True)
@@ -246,6 +248,7 @@ def voltage_map(
     file: Path,
     strain_column: str | None,
     voltage_column: str | None,
+    volt_per_monitor_volt: float | None,
     actuator: Path | None,
     *,
     columns: ColumnOptions,
@@ -262,9 +265,11 @@ def voltage_map(
     strain, voltage_v = read_quantities(
         file, {STRAIN: strain_column, VOLTAGE: voltage_column}, columns, known
     )
-    fit = fit_voltage_map(strain, voltage_v)
-    if fit.succeeded and (known is None or known.drive.gain_v_per_v is None):
-        name = VOLTAGE.column(file, voltage_column)
+    name = VOLTAGE.column(file, voltage_column)
+    drive_v = drive_of(name, voltage_v, file, known, volt_per_monitor_volt)
+    fit = fit_voltage_map(strain, drive_v)
+    unknown = known is None or (known.drive.gain_v_per_v is None and known.drive.high_v is None)
+    if fit.succeeded and unknown:
         fit = replace(fit, notes=(*fit.notes, *_voltage_notes(name, voltage_v, file, columns)))
     emit_fit(fit, [file], as_json, out, units={"hysteresis_width": "V"})
     if actuator is not None:
@@ -312,7 +317,8 @@ def capacitance_map(
 
     The map is a straight line (eq. 5 of the paper). FILE has the columns of capacitance and
     strain. The slope is per F for a capacitance in F, and per unit of relative capacitance
-    otherwise. With --actuator, a polynomial of degree 1 to 3 is fitted too.
+    otherwise. With --actuator, a polynomial of degree 1 to 3 is fitted and written; the line is
+    then a comparison only.
     """
     known = None if actuator is None else load_actuator(actuator, to_write=True)
     files = [file] if strain_file is None else [file, strain_file]
@@ -323,25 +329,38 @@ def capacitance_map(
         fit = replace(fit, parameters={**fit.parameters, "slope": slope})
     fit = replace(fit, notes=(*fit.notes, *_slope_notes(fit, known)))
     more: dict[str, object] = {}
+    shown: dict[str, object] | None = None
     if actuator is not None and fit.succeeded:
         section = save_strain_map(actuator, pairs, files)
         found = {name: part for name, part in section.items() if part is not None}
-        more = {"strain_map": found if as_json or out is not None else _for_loops(section)}
-    emit_fit(fit, files, as_json, out, more)
+        more, shown = {"strain_map": found}, _written(section, fit)
+    emit_fit(fit, files, as_json, out, more, shown=shown)
     axis = "Capacitance (F)" if pairs.in_farads else "Capacitance (as in the file)"
     if pairs.column.startswith("relative"):
         axis = "Relative capacitance"
     save_plot(plot, lambda: fit.chart((axis, "Strain")))
 
 
-def _for_loops(section: Mapping[str, Any]) -> str:
-    """What the screen shows of [sensing.strain_map]: how far a strain can be from the map."""
-    ends = section["band"]
-    band = "" if ends is None else (
-        f"{100.0 * section['coverage']:.0f} % of strains within {ends[0]:+.2g} to {ends[1]:+.2g} "
-        "of it; "
-    )  # fmt: skip
-    return f"map for loops: {band}written to [sensing.strain_map]"
+def _written(section: Mapping[str, Any], fit: CapacitanceMapFit) -> dict[str, object]:
+    """What the screen shows of a map that was written, with the line as a comparison only."""
+    names = ("slope_per_f", "offset", "curvature_per_f2", "cubic_per_f3", "range_f")
+    found = {name: section[name] for name in names if section.get(name) is not None}
+    if section["band"] is not None:
+        low, high = section["band"]
+        found["band"] = (
+            f"{100.0 * section['coverage']:.0f} % of strains within {low:+.2g} to {high:+.2g} of it"
+        )
+    line = (
+        f"{fit.parameters['slope'].value:.4g} C {fit.parameters['offset'].value:+.4g}, r_squared "
+        f"{fit.r_squared:.6g}"
+    )
+    answer = fit.answer()
+    return {
+        "[sensing.strain_map], written": found,
+        "line, not written": line,
+        "status": answer["status"],
+        "notes": answer["notes"],
+    }
 
 
 def _slope_notes(fit: CapacitanceMapFit, known: ActuatorTables | None) -> tuple[str, ...]:

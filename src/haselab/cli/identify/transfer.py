@@ -10,13 +10,14 @@ from typing import Any
 import click
 import numpy as np
 
-from haselab.base import InputError
+from haselab.base import HaselabError, InputError, ResultError
 from haselab.cli.actuator_file import load_actuator, save_section
 from haselab.cli.columns import column_options
 from haselab.cli.common import INTEGER, REAL, SEED, actuator_option, answer_options, waiting
 from haselab.cli.identify.common import (
     FILES,
     INPUT,
+    MONITOR_SCALE,
     OUTPUT,
     RATE,
     axis_names,
@@ -40,6 +41,8 @@ from haselab.identify.transfer.nonlinear import NONLINEAR, fit_nonlinear
 from haselab.pipelines.design.sections import MODEL_KEYS, model_section
 from haselab.store.columns.selection import ColumnOptions
 
+_RELATED = 1e-3  # probability below which the residuals follow the input
+_SMALL = 0.1  # of the motion of the slow modes: residuals that do not change them
 _FAR_GAIN = 5.0  # creep and a map of another loop change the gain by less
 
 __all__ = ["transfer"]
@@ -112,6 +115,7 @@ def _fixed(pairs: Sequence[str]) -> dict[str, float]:
     "--seed", type=SEED, default=1, show_default=True, detail="Only --bootstrap uses it."
 )
 @shared_option("--through-voltage-map", is_flag=True)
+@MONITOR_SCALE
 @actuator_option("The command reads [drive.voltage_map] and writes [model] with its covariance.")
 @column_options
 @answer_options(plot=True)
@@ -147,6 +151,11 @@ def transfer(
             "--through-voltage-map needs the map in an actuator file. Name the file with "
             "--actuator."
         )
+    if actuator is None and options["volt_per_monitor_volt"] is not None:
+        raise InputError(
+            "--volt-per-monitor-volt needs gain_v_per_v in [drive] of an actuator file. Name the "
+            "file with --actuator."
+        )
     if actuator is not None:
         if options["nonlinear"]:
             raise InputError(
@@ -167,6 +176,8 @@ def transfer(
                 columns,
                 hold=options["hold"],
                 through=actuator if options["through_voltage_map"] else None,
+                drive_of_file=actuator,
+                volt_per_monitor_volt=options["volt_per_monitor_volt"],
             )
             records += found_records.records
             origins += [file] * len(found_records.records)
@@ -203,23 +214,38 @@ def transfer(
                 f"--bootstrap needs a linear model, but {fit.kind} was chosen. Leave it out."
             )
         more["bootstrap"] = bootstrap_transfer(fit, options["bootstrap"], rng)
+    section: dict[str, object] | None = None
+    refused: HaselabError | None = None
+    if actuator is not None and fit.succeeded:
+        through = options["through_voltage_map"]
+        try:
+            section = _section(actuator, fit, (modelled, measured), units, through)
+        except ResultError as error:
+            refused = ResultError(f"{error}: {' '.join(str(file) for file in files)}")
+            more["status"] = str(error)
+        except InputError as error:
+            refused, more["status"] = error, str(error)
+        if through and (note := _note_on_slow_modes(fit)):
+            said = found.answer()["notes"]
+            more["notes"] = [*(said if isinstance(said, list) else []), note]
     emit_fit(found, files, as_json, out, more)
-    if options["through_voltage_map"] and fit.succeeded:
-        _warn_of_gain(fit, output, units[1])
-    if actuator is not None:
-        _save(actuator, fit, (modelled, measured), units, files, options["through_voltage_map"])
+    if refused is not None:  # after the answer, whose status says so too
+        raise refused
+    if actuator is not None and section is not None:
+        if options["through_voltage_map"]:
+            _warn_of_gain(fit, output, units[1])
+        save_section(actuator, "model", section, files, MODEL_KEYS)
     save_plot(plot, lambda: fit.chart(axis_names(modelled, measured, units)))
 
 
-def _save(
+def _section(
     actuator: Path,
     fit: TransferFit,
     names: tuple[str, str],
     units: tuple[str, str],
-    files: tuple[Path, ...],
     through_map: bool,
-) -> None:
-    """Write [model] of the actuator file."""
+) -> dict[str, object]:
+    """[model] of the actuator file."""
     if isinstance(fit, NonlinearFit):
         raise InputError(
             f"[model] was not changed: it needs a linear model, but --choose selected {fit.kind}. "
@@ -228,7 +254,30 @@ def _save(
     section = model_section(fit, names, units)
     used = load_actuator(actuator).drive.voltage_map if through_map else None
     section["through_voltage_map"] = None if used is None else used.coefficients
-    save_section(actuator, "model", section, files, MODEL_KEYS)
+    return section
+
+
+def _note_on_slow_modes(fit: TransferFit) -> str:
+    """A note if the error of the voltage map is as large as the slow modes that were fitted.
+
+    The map is a sum of two exponentials. Where its slope is off by 10 %, a step of the strain
+    differs by as much as a creep of 10 %, and no interval contains this.
+    """
+    if fit.input_range is None or not fit.slow_modes or fit.input_correlation_p > _RELATED:
+        return ""
+    slow = sum(abs(gain.value) for gain, _ in fit.slow_modes)
+    half = 0.5 * (fit.input_range[1] - fit.input_range[0])
+    residual_std = float(np.sqrt(np.mean(np.concatenate(fit.residuals) ** 2)))
+    if residual_std < _SMALL * slow * half:  # false for a slow mode that is not identifiable
+        return ""
+    return (
+        "The residuals follow the input and are not small beside the slow modes, for example "
+        "because the voltage map is not exact; the intervals of the slow modes do not include "
+        "this. Fit the slow modes from the drive: leave out --through-voltage-map and --actuator, "
+        "and add --nonlinear hammerstein-2. If its residuals are smaller beside its output, repeat "
+        "this command with --fix slow_time_constant_s=... and --fix slow_gain=..., the slow gain "
+        "of that fit divided by its gain."
+    )
 
 
 def _agreed(

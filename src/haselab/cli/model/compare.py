@@ -17,6 +17,7 @@ from haselab.cli.columns import column_options
 from haselab.cli.common import POSITIVE, REAL, SEED, answer_options, emit, unverified_option
 from haselab.cli.identify.common import (
     FILES,
+    MONITOR_SCALE,
     RATE,
     axis_names,
     name_files_in_errors,
@@ -87,6 +88,7 @@ _NO_NOISE = (
 )  # fmt: skip
 @shared_option("--at-rest", is_flag=True, detail="Its state and offset are then taken as 0.")
 @shared_option("--through-voltage-map", is_flag=True)
+@MONITOR_SCALE
 @shared_option("--hold", type=click.Choice(HOLDS), detail="Default: zero. Use the same value "
                "as in 'identify transfer'.")  # fmt: skip
 @shared_option("--held-at-hz", type=REAL, detail="Default: the sampling rate of the file.")
@@ -121,6 +123,7 @@ def command(
     rate_hz: float | None,
     at_rest: bool,
     through_voltage_map: bool,
+    volt_per_monitor_volt: float | None,
     which: str,
     hold: str | None,
     held_at_hz: float | None,
@@ -158,7 +161,7 @@ def command(
     without its input. The page 'Your actuator' of the documentation has the exact rules.
     """
     linear = at_rest or through_voltage_map or held_at_hz is not None
-    linear |= hold is not None
+    linear |= hold is not None or volt_per_monitor_volt is not None
     table = TableOptions(
         _given(context, "source", source), outputs, rate_hz,
         mass_kg, gain_v_per_v, zero_length_m, columns,
@@ -166,8 +169,14 @@ def command(
     options = PhysicalOptions(experiments, free_offset, longest_m, unverified, table)
     if which == "physical" and linear:
         raise InputError(
-            "--at-rest, --through-voltage-map, --hold and --held-at-hz are for linear models. "
-            "Leave them out, or use --model linear."
+            "--at-rest, --through-voltage-map, --volt-per-monitor-volt, --hold and --held-at-hz "
+            "are for linear models. Leave them out, or use --model linear."
+        )
+    if volt_per_monitor_volt is not None and not through_voltage_map:
+        raise InputError(
+            "--volt-per-monitor-volt converts a monitor to the drive, which needs "
+            "--through-voltage-map. Add it, or leave out --volt-per-monitor-volt. For the physical "
+            "model, use --gain-v-per-v."
         )
     if which == "physical" or (which == "auto" and not linear and has_physical_model(model)):
         compare_physical(model, files, options, as_json=as_json, out=out, plot=plot)
@@ -193,6 +202,7 @@ def command(
             found = read_recorded(
                 file, (source, output), rate_hz, held_at_hz, columns, hold=hold, through=through,
                 to_strain=origin.output_unit != "m",
+                volt_per_monitor_volt=volt_per_monitor_volt,
             )  # fmt: skip
             _check_units(origin, found.units, (source, output), through_voltage_map)
             recorded += found.records
@@ -212,7 +222,7 @@ def command(
     prediction = note_range(prediction, recorded, origin.input_range)
     if math.isnan(prediction.used_for_fit):
         why = _why_unknown(_training_output(origin), records)
-        click.echo(f"haselab: warning: {why}. {model}", err=True)
+        click.echo(f"haselab: warning: {why}. File: {model}", err=True)
     emit(_answer(prediction, no_band), as_json=as_json, out=out)
     names = ", ".join(file.name for file in files)
     title = f"Prediction of {names}: {prediction.fit_percent:.1f} %"

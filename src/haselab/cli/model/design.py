@@ -166,7 +166,7 @@ def command(
         low_v, high_v = origin.input_range
         click.echo(
             f"haselab: --limits count from the operating point of the model's records, whose input "
-            f"is {low_v:.3g} to {high_v:.3g} V. {model}",
+            f"is {low_v:.3g} to {high_v:.3g} V. File: {model}",
             err=True,
         )
     setting = sensed_loop(LoopSetting(rate_hz, delay_s, limits), model)
@@ -203,6 +203,8 @@ def command(
     units = gain_units(*ends, strains=origin.is_of_strains)
     emit(answer, as_json=as_json, out=None, units=units)
     names = axis_names("Controller output", "Output", ends)
+    if origin.is_of_strains:
+        names = "Controller output, strain", "Strain"
     save_plot(plot, lambda: design.chart(names))
 
 
@@ -221,7 +223,7 @@ def _own_design(
     if physical is not None and physical.status != "ok":
         click.echo(
             f"haselab: warning: the status of [model.physical], which the design uses, is: "
-            f"{physical.status}. {model}",
+            f"{physical.status}. File: {model}",
             err=True,
         )
     stated = (None, None) if tables.model is None else (
@@ -251,7 +253,7 @@ def _own_design(
                 f"haselab: The limits are strains of {strains[0]:.3g} to {strains[1]:.3g} instead "
                 f"of {low:.3g} to {high:.3g}, which the drive reaches: for the rest, the drive is "
                 "near 0 V, where the pouches are slack and the capacitance hardly depends on the "
-                f"length. {model}",
+                f"length. File: {model}",
                 err=True,
             )
     if actuator is not None and kind.output == "voltage":

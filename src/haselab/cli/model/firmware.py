@@ -138,7 +138,11 @@ def build(
     front_end = load_board(board).front_end if file is None else file.front_end.front_end()
     module = ModuleLimits() if file is None else file.module
     design = read_design(run, structure, front_end, source, module)
-    _check_gain(design.tables.drive.gain_v_per_v, front_end.gain, run)
+    _check_gain(
+        design.tables.drive.gain_v_per_v, front_end.gain, run,
+        "state its gain as gain in [front_end] of a rig file with kind 'chip', and build with "
+        "--rig (docs/control/firmware.md, 'The rig file of a microcontroller')",
+    )  # fmt: skip
     _check_current(design, front_end, run, "Lower its gain:")
     settings = design.settings if file is None else file.limited(design.settings)
     _say_narrowed(settings, design.limits, run)
@@ -147,14 +151,14 @@ def build(
     emit({**_sizes(built), **limits, "hex": str(built.hex)}, as_json=as_json, out=out)
 
 
-def _check_gain(recorded: float | None, module: float, run: Path) -> None:
+def _check_gain(recorded: float | None, module: float, run: Path, advice: str) -> None:
     """Refuse a module that turns the voltages of the map into another high voltage."""
     if recorded is not None and abs(module / recorded - 1.0) > _GAIN_TOLERANCE:
         raise InputError(
             f"[drive] gain_v_per_v is {recorded:g}, but the high-voltage module of the front end "
             f"has a gain of {module:g}: it would put out {module / recorded:.3g} times the high "
-            "voltage of the records. Identify the voltage map from the drive that this module "
-            f"needs, or state the module's gain in [front_end] (--rig). {run}"
+            f"voltage of the records. If your module has another gain, {advice}. Else identify the "
+            f"voltage map from the drive that this module needs: {run}"
         )
 
 
@@ -269,6 +273,10 @@ def simulate(
     front_end = FrontEnd()
     design = read_design(run, structure, front_end, source)
     refuse_other_kind(design.tables, run, config)
+    _check_gain(
+        design.tables.drive.gain_v_per_v, front_end.gain, run,
+        "'firmware simulate' cannot simulate it; build the firmware with --rig",
+    )  # fmt: skip
     _check_current(
         design, front_end, run, "It cannot be simulated with another gain; build it with"
     )

@@ -81,7 +81,7 @@ def read_physical_model(path: Path) -> tuple[IdentifiedModel, ActuatorTables]:
             )
         click.echo(
             f"haselab: warning: [model.physical] has the status {model.status!r}. The band allows "
-            f"for an error like those in the records of the fit. {path}",
+            f"for an error like those in the records of the fit. File: {path}",
             err=True,
         )
     matrix = np.array(model.covariance.matrix, dtype=np.float64).reshape(len(names), len(names))

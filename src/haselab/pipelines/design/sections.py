@@ -61,9 +61,16 @@ def model_section(
     """
     unknown = [name for name, estimate in fit.parameters.items() if np.isnan(estimate.value)]
     if unknown:
+        slow = any(name.startswith("slow_") for name in unknown)
         raise ResultError(
-            f"Not identifiable from these records: {', '.join(unknown)}. [model] was not written. "
-            "Add a record that determines it, fit a simpler structure, or give it with --fix."
+            f"[model] was not written: {', '.join(unknown)} not identifiable from these records. "
+            + (
+                "Add a record with a step that is held for several time constants before and after "
+                "it, or leave out --slow-modes, or give them with --fix"
+                if slow
+                else "Add a record that determines it, fit a simpler structure, or give it with "
+                "--fix"
+            )
         )
     value = {name: estimate.value for name, estimate in fit.parameters.items()}
     simple = fit.structure.poles == 2 and not fit.structure.zeros

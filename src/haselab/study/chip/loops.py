@@ -266,8 +266,11 @@ def _check_capacitance(settings: ChipSettings, bench: TwinBench) -> None:
         raise InputError(
             f"The actuator of the twin has {1e12 * found_f:.4g} pF at 0 V, but the microcontroller "
             f"accepts {1e12 * low_f:.4g} to {1e12 * high_f:.4g} pF, from the strain map and the "
-            "limits of the controller. Simulate with a twin of this actuator (--twin TWIN.toml, "
-            "from haselab twin new), or check the unit and the scales of the capacitance."
+            "limits of the controller. A simulation needs a physical model of this actuator, which "
+            "maps and [model] do not replace: run 'haselab identify actuator RECORDS --actuator "
+            "A.toml' and add --twin A.toml, or state its parameters in --twin TWIN.toml (haselab "
+            "twin new). Without one, 'haselab design A.toml' predicts the step from [model], and "
+            "'haselab firmware build' works. Or check the unit and the scales of the capacitance."
         )
 
 

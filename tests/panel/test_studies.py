@@ -331,7 +331,7 @@ def recording(files: PanelFiles, name: str, rows: dict[str, tuple[float, float]]
     (folder / "session.h5").touch()
     quantities = [
         {"id": key, "name": key, "unit": "V",
-         "measured": {"value": value, "std": std, "ci95": [value - std, value + std]}}
+         "measured": {"value": value, "std": std, "ci95": [value - 1.96 * std, value + 1.96 * std]}}
         for key, (value, std) in rows.items()
     ]  # fmt: skip
     (folder / "results.json").write_text(json.dumps({"quantities": quantities}))
@@ -342,6 +342,8 @@ def test_the_difference_of_two_recordings_is_in_deviations_of_both(files: PanelF
     recording(files, "b", {"x": (2.5, 0.4), "new": (1.0, 0.1), "exact": (20.0, 0.0)})
     rows = {row["id"]: row for row in compare(files, {"first": "a", "second": "b"})["rows"]}
     assert rows["x"]["deviations"] == pytest.approx(3.0)  # 1.5 over hypot(0.3, 0.4)
+    assert rows["x"]["difference"] == 1.5 and rows["x"]["exceeds"] is True
+    assert rows["x"]["difference_ci95"] == pytest.approx([0.52, 2.48])  # 1.5 +- 1.96 * 0.5
     assert rows["gone"]["second"] is None and rows["new"]["first"] is None
     assert rows["exact"]["deviations"] is None
     in_mv = (files.runs / "b" / "results.json").read_text().replace('"V"', '"mV"')
@@ -352,7 +354,8 @@ def test_the_difference_of_two_recordings_is_in_deviations_of_both(files: PanelF
     assert [row["unit"] for row in both] == ["V", "mV"], "numbers of two units are not compared"
     assert all(row["deviations"] is None for row in both)
     (files.runs / "b" / "results.json").write_text("{}")
-    with pytest.raises(InputError, match="b has no results"):
+    message = r"results.json of the run cannot be read.*/b'. On this page, press Analyse"
+    with pytest.raises(InputError, match=message):
         compare(files, {"first": "a", "second": "b"})
 
 
@@ -380,7 +383,7 @@ def test_results_that_are_not_of_haselab_are_refused(files: PanelFiles, row: Any
     (files.runs / "a" / "results.json").write_text(
         json.dumps({"quantities": [{"id": "x", "name": "x", "unit": "", "measured": row}]})
     )
-    with pytest.raises(InputError, match="a has no results that can be read"):
+    with pytest.raises(InputError, match=r"results.json of the run cannot be read"):
         compare(files, {"first": "a", "second": "a"})
 
 

@@ -9,7 +9,7 @@ import os
 import sys
 import threading
 import time
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager, suppress
 from dataclasses import replace
 from pathlib import Path
@@ -181,6 +181,7 @@ def emit(
     shorter: Mapping[str, Any] | None = None,
     units: Mapping[str, str] | None = None,
     shown: Mapping[str, Any] | None = None,
+    lines: Sequence[str] | None = None,
 ) -> None:
     """Print an answer (JSON or readable lines) and, if `out` is given, write its JSON there.
 
@@ -191,6 +192,7 @@ def emit(
         shorter: what the readable lines have in place of long parts of the answer.
         units: by name, of numbers whose unit is neither in their name nor in the answer.
         shown: what the readable lines have in place of the whole answer.
+        lines: printed in place of the readable lines of the answer.
     """
     text = json.dumps(to_plain(answer), indent=2)
     if out is not None:
@@ -198,8 +200,10 @@ def emit(
     if as_json:
         click.echo(text)
     else:
-        lines = {**answer, **(shorter or {})} if shown is None else shown
-        click.echo("\n".join(readable(lines, units)))
+        if lines is None:
+            all_of_it = {**answer, **(shorter or {})}
+            lines = readable(all_of_it if shown is None else shown, units)
+        click.echo("\n".join(lines))
 
 
 class _BarProgress:

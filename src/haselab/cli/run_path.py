@@ -10,9 +10,19 @@ import click
 from haselab.base import InputError
 from haselab.store.actuator_file import ACTUATOR
 
-__all__ = ["ACTUATOR_FILE", "MODEL_FILE"]
+__all__ = ["ACTUATOR_FILE", "MODEL_FILE", "RUN_OR_MODEL", "is_run"]
 
+_OF_RUN = ("results.json", "session.h5")
 _MODEL = "model.json"  # of the folder of an older run
+
+
+def is_run(path: Path) -> bool:
+    """Whether a path is the folder of a run: it has results or a recording.
+
+    Args:
+        path: of any file or folder.
+    """
+    return path.is_dir() and any((path / name).exists() for name in _OF_RUN)
 
 
 class _InRun(click.Path):
@@ -41,5 +51,19 @@ class _InRun(click.Path):
         )
 
 
+class _RunOrInRun(_InRun):
+    """The same, but the folder of a run stays a folder."""
+
+    def convert(self, value: Any, param: click.Parameter | None, ctx: click.Context | None) -> Path:
+        """Return the folder of a run, or a file.
+
+        Raises:
+            InputError: another folder, without any of the files.
+        """
+        path = Path(click.Path(path_type=Path).convert(value, param, ctx))
+        return path if is_run(path) else super().convert(value, param, ctx)
+
+
 ACTUATOR_FILE = _InRun(ACTUATOR)
 MODEL_FILE = _InRun(ACTUATOR, _MODEL)
+RUN_OR_MODEL = _RunOrInRun(ACTUATOR, _MODEL)

@@ -28,6 +28,7 @@ from haselab.cli.identify.common import (
 )
 from haselab.cli.identify.recorded_motion import TableOptions
 from haselab.cli.model.charts import prediction_chart
+from haselab.cli.model.compare_runs import RunPair, refuse_runs_without_model
 from haselab.cli.model.physical_comparison import (
     PhysicalOptions,
     compare_physical,
@@ -36,7 +37,7 @@ from haselab.cli.model.physical_comparison import (
 from haselab.cli.model.physical_model import has_physical_model
 from haselab.cli.options import shared_option
 from haselab.cli.plot import save_plot
-from haselab.cli.run_path import MODEL_FILE
+from haselab.cli.run_path import MODEL_FILE, RUN_OR_MODEL
 from haselab.identify.fit import Prediction
 from haselab.identify.prediction import note_range, predict
 from haselab.identify.record import HOLDS, Record
@@ -65,8 +66,11 @@ _NO_NOISE = (
 
 
 @click.command("compare")
-@click.argument("model", type=MODEL_FILE)
+@click.argument("model", type=RUN_OR_MODEL)
 @FILES
+@click.option("--results", is_flag=True,
+              help="Compare the results of two runs row by row; MODEL and FILES are their folders. "
+              "Default: only if the first run has no physical model.")  # fmt: skip
 @shared_option(
     "--input",
     "source",
@@ -118,6 +122,7 @@ def command(
     context: click.Context,
     model: Path,
     files: tuple[Path, ...],
+    results: bool,
     source: str,
     outputs: tuple[str, ...],
     rate_hz: float | None,
@@ -156,10 +161,21 @@ def command(
     record, unless --at-rest is given. used_for_fit is the share of samples that were used for the
     fit; it is null if the command cannot tell a copy of the record from a repetition.
 
-    The exit code is 3 if used_for_fit is above 5 %, if the prediction is worse than the mean of the
-    record, if the error is too large for the band, or if the record can be explained as well
-    without its input. The page 'Your actuator' of the documentation has the exact rules.
+    With --results, MODEL and FILES are the folders of two runs. The command prints each result of
+    both with its 95 % interval, the difference (second minus first) with its interval, and whether
+    it is larger than noise explains. It lists rows that only one run has, and what else differs.
+    The exit code is 3 if a difference is larger than noise explains.
+
+    For a linear model, the exit code is 3 if used_for_fit is above 5 %, if the prediction is worse
+    than the mean of the record, if the error is too large for the band, or if the record can be
+    explained as well without its input. The page 'Your actuator' of the documentation has the exact
+    rules.
     """
+    runs = RunPair(model, files)
+    if results or runs.is_meant(context):
+        runs.compare(context, as_json=as_json, out=out)
+        return
+    model = MODEL_FILE.convert(model, None, context)
     linear = at_rest or through_voltage_map or held_at_hz is not None
     linear |= hold is not None or volt_per_monitor_volt is not None
     table = TableOptions(
@@ -182,6 +198,7 @@ def command(
         compare_physical(model, files, options, as_json=as_json, out=out, plot=plot)
         return
     refuse_for_linear(options)
+    refuse_runs_without_model(model, files)
     if len(outputs) > 1:
         raise InputError(
             f"--output is given {len(outputs)} times, but a linear model has one output. Give it "

@@ -3,8 +3,6 @@
 from __future__ import annotations
 
 import functools
-import json
-import math
 import shlex
 import subprocess
 import sys
@@ -12,8 +10,9 @@ import threading
 from pathlib import Path
 from typing import Any
 
-from haselab.base import InputError, JsonObject, is_real, shown
+from haselab.base import InputError, Json, JsonObject, shown, to_plain
 from haselab.panel.files import PanelFiles
+from haselab.pipelines.compare_results import compare_results
 from haselab.store.folder import write_text
 from haselab.store.manifest import MANIFEST, read_manifest, recorded_when
 from haselab.store.text_file import read_text
@@ -242,56 +241,18 @@ def compare(files: PanelFiles, values: JsonObject) -> JsonObject:
         files: of the panel.
         values: `first` and `second`, names of recordings.
     Returns:
-        `rows`: id, name, unit, both values with their intervals, and the difference in standard
-        deviations of both together; null where a recording has no such row or no deviation. A row
-        with two units is two rows.
+        `rows`: id, name, unit, both values with their intervals, the difference, its interval and
+        its size in standard deviations of both together, and whether it is larger than noise
+        explains; null where a recording has no such row or no deviation. A row with two units is
+        two rows. `limit`: the standard deviations beyond which noise does not explain a difference
+        in so many rows. `notes`: what else differs.
     Raises:
         InputError: there is no such recording, or one has no results.
     """
-    first, second = (_results(files, values.get(which)) for which in ("first", "second"))
-    rows = []
-    for key in {**first, **second}:
-        one, other = first.get(key), second.get(key)
-        if one and other and one["unit"] != other["unit"]:  # of two versions: not comparable
-            rows += [_row(key, one, None), _row(key, None, other)]
-        else:
-            rows.append(_row(key, one, other))
-    return {"rows": rows}
-
-
-def _results(files: PanelFiles, name: object) -> dict[str, Any]:
-    folder = _recording(files, name)
+    first, second = (_recording(files, values.get(which)) for which in ("first", "second"))
     try:
-        content = json.loads(read_text(folder / "results.json"))
-        found = {str(row["id"]): row for row in content["quantities"] if row["measured"]}
-        if not all(_is_result(row) for row in found.values()):
-            raise ValueError
-        return found
-    except (ValueError, KeyError, TypeError):
-        raise InputError(
-            f"{folder.name} has no results that can be read. Press Analyse first."
-        ) from None
-
-
-def _is_result(row: dict[str, Any]) -> bool:
-    """Whether a row can be shown; a number that is not known is null."""
-    measured = row["measured"]
-    numbers = (measured["value"], measured["std"], *measured["ci95"])
-    texts = (row["name"], row["unit"])
-    return all(one is None or is_real(one) for one in numbers) and all(
-        isinstance(one, str) for one in texts
-    )
-
-
-def _row(key: str, first: dict[str, Any] | None, second: dict[str, Any] | None) -> dict[str, Any]:
-    one, other = (None if row is None else row["measured"] for row in (first, second))
-    deviations = None
-    if one and other:
-        together = math.hypot(one["std"] or math.nan, other["std"] or math.nan)
-        if together > 0.0 and None not in (one["value"], other["value"]):
-            deviations = (other["value"] - one["value"]) / together
-    about = first or second or {}
-    return {
-        "id": key, "name": about["name"], "unit": about["unit"], "first": one,
-        "second": other, "deviations": deviations,
-    }  # fmt: skip
+        found = compare_results(first, second)
+    except InputError as error:
+        raise InputError(f"{error} On this page, press Analyse.") from None
+    rows: list[Json] = [to_plain(row.to_dict()) for row in found.rows]
+    return {"rows": rows, "limit": found.limit_deviations, "notes": list(found.notes)}

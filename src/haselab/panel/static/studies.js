@@ -71,11 +71,12 @@ function Comparison({ link, names, close }) {
   if (found === null) return html`<p role="status">Comparing …</p>`;
   if (found.error) return html`<p class="error" role="alert">${found.error}</p>`;
   const cell = (one) => (one === null ? "–" : html`${number(one.value)} <small>[${number(one.ci95[0])}, ${number(one.ci95[1])}]</small>`);
-  return html`<div class="card"><h2>Comparison</h2><p>Difference: ${names[1]} minus ${names[0]}, divided by their combined standard deviation. Values beyond 3 are red.</p>
+  return html`<div class="card"><h2>Comparison</h2><p>Difference: ${names[1]} minus ${names[0]}, divided by their combined standard deviation. A red value is larger than noise explains: 0 is outside the 95 % interval of the difference, and the value is beyond ${fixed(found.limit, 1)}, which the largest of so many rows exceeds by noise alone in 5 % of comparisons.</p>
+    ${found.notes.map((one) => html`<p>Note: ${one}.</p>`)}
     <button type="button" onClick=${close}>Close</button>
     <table class="wide"><thead><tr><th scope="col">Row</th><th scope="col">Name</th><th scope="col">Unit</th><th scope="col">${names[0]}</th><th scope="col">${names[1]}</th><th scope="col">Difference</th></tr></thead>
     <tbody>${found.rows.map((one) => html`<tr><td data-label="Row">${one.id}</td><td data-label="Name">${one.name}</td><td data-label="Unit">${one.unit}</td><td data-label=${names[0]}>${cell(one.first)}</td><td data-label=${names[1]}>${cell(one.second)}</td>
-      <td data-label="Difference" class=${Math.abs(one.deviations) > 3 ? "error" : ""}>${one.deviations === null ? "–" : fixed(one.deviations, 1)}</td></tr>`)}</tbody></table></div>`;
+      <td data-label="Difference" class=${one.exceeds ? "error" : ""}>${one.deviations === null ? "–" : fixed(one.deviations, 1)}</td></tr>`)}</tbody></table></div>`;
 }
 
 const drafts = new Map(); // notes that are typed and not saved, by recording, with the note that was shown before

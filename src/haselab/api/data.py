@@ -5,13 +5,14 @@ from __future__ import annotations
 import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
+from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, TypeAlias
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from haselab.base import InputError, checked, real_array, shown
+from haselab.base import InputError, checked, is_real, real_array, shown
 from haselab.identify.record import Record
 from haselab.pipelines.examples.data_sets import find_data_set, write_data_set
 from haselab.pipelines.sensing.series import derived_series
@@ -21,6 +22,7 @@ from haselab.store.columns.selection import TIME_NAMES, ColumnOptions
 from haselab.store.columns.table import Table, read_every_column, read_table
 from haselab.store.columns.units import Unit, parse_unit, split_header
 from haselab.store.export.frames import session_dataset, session_tables
+from haselab.store.export.session import Derived
 from haselab.store.session.reader import SessionReader, session_file
 
 if TYPE_CHECKING:
@@ -51,30 +53,43 @@ class Session:
     path: Path
     experiments: tuple[str, ...]
 
-    def to_pandas(self, experiment: str = "") -> dict[str, pandas.DataFrame]:
+    def to_pandas(
+        self, experiment: str = "", *, zero_length_m: float | None = None
+    ) -> dict[str, pandas.DataFrame]:
         """One experiment as pandas tables.
 
         Args:
             experiment: its name; the session's only one need not be named.
+            zero_length_m: length at zero strain, in m, for the column `strain`. None: that of an
+                imported session, else that of the actuator file beside the session.
         Returns:
             `monitors`, `blocks`, `tracks`, `events`, and `capacitance` and `strain` where the
-            session states what they need.
+            session states what they need. The table `strain` has a column `strain` if the length
+            at zero strain is known; `strain_from_start` is relative to the first frame.
         Raises:
-            InputError: no such experiment, or pandas is not installed.
+            InputError: no such experiment, no positive length, or pandas is not installed.
         """
-        return session_tables(self.path, self._one(experiment), derived=derived_series)
+        return session_tables(
+            self.path, self._one(experiment), derived=_with_zero_length(zero_length_m)
+        )
 
-    def to_xarray(self, experiment: str = "") -> xarray.Dataset:
+    def to_xarray(
+        self, experiment: str = "", *, zero_length_m: float | None = None
+    ) -> xarray.Dataset:
         """One experiment as an xarray data set, with units.
 
         Args:
             experiment: its name; the session's only one need not be named.
+            zero_length_m: length at zero strain, in m, for the column `strain`. None: that of an
+                imported session, else that of the actuator file beside the session.
         Returns:
             The monitors over block and sample, the tracks over frame and point, and what follows.
         Raises:
-            InputError: no such experiment, or xarray is not installed.
+            InputError: no such experiment, no positive length, or xarray is not installed.
         """
-        return session_dataset(self.path, self._one(experiment), derived=derived_series)
+        return session_dataset(
+            self.path, self._one(experiment), derived=_with_zero_length(zero_length_m)
+        )
 
     def _one(self, experiment: str) -> str:
         """The named experiment, or the only one."""
@@ -84,6 +99,17 @@ class Session:
             f"The session has {len(self.experiments)} experiments. Name one of them: "
             f"{', '.join(self.experiments)}."
         )
+
+
+def _with_zero_length(zero_length_m: float | None) -> Derived:
+    """What is computed from an experiment, with a length that was checked."""
+    if zero_length_m is not None and not (
+        is_real(zero_length_m) and 0.0 < zero_length_m < math.inf
+    ):
+        raise InputError(
+            f"zero_length_m is {shown(zero_length_m)}; it must be a number above 0 m and finite."
+        )
+    return partial(derived_series, zero_length_m=zero_length_m)
 
 
 @checked

@@ -97,6 +97,7 @@ class Actuator:
             those of the reference study.
         plant: the model, in general rational form if it is not one resonance; None: not known yet.
         physical: what controllers of the physical model use; None: not known yet.
+        zero_length_m: length between the fiducials at zero strain, in m; None: not known yet.
     """
 
     voltage_map: VoltageMap | None = None
@@ -105,6 +106,7 @@ class Actuator:
     saturation: Saturation | None = None
     plant: Plant | RationalModel | None = None
     physical: KnownActuator | None = None
+    zero_length_m: float | None = None
 
     def __post_init__(self) -> None:
         check_fields(self)
@@ -137,6 +139,7 @@ class Actuator:
             limits,
             None if model is None or not model.model_extra else _plant(tables, Path(path)),
             _physical(tables, chosen, path),
+            tables.actuator.geometry.zero_length_m,
         )
 
     def loop(self) -> LoopSettings:

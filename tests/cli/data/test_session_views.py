@@ -4,12 +4,14 @@ from __future__ import annotations
 
 import importlib
 import json
+import shutil
 from pathlib import Path
 
 import numpy as np
 import pytest
 from scipy.io import loadmat
 
+import haselab as hl
 from haselab.base import InputError
 from haselab.cli.main import main
 from haselab.pipelines.sensing.series import derived_series
@@ -70,6 +72,43 @@ def test_a_session_as_pandas_tables(session):
     np.testing.assert_allclose(tables["strain"]["strain_from_start"], STRAIN, atol=1e-12)
     np.testing.assert_allclose(tables["strain"]["length_m"][0], 100.0 * SCALE)
     assert set(session_tables(session, "bare")) == {"monitors", "blocks", "tracks", "events"}
+
+
+@pytest.fixture
+def beside(session, tmp_path):
+    """The session with the actuator file of its run; its length is 100 px at the start."""
+    shutil.copy(session, tmp_path)
+    (tmp_path / "actuator.toml").write_text("[actuator.geometry]\nzero_length_m = 0.025\n")
+    return tmp_path / "session.h5"
+
+
+def test_the_strain_of_a_run_is_relative_to_its_own_zero_length(beside, session, tmp_path):
+    expected = 100.0 * SCALE / 0.025 * (1.0 + np.array(STRAIN)) - 1.0
+    one = hl.load(beside)
+    np.testing.assert_allclose(one.to_pandas("step-1")["strain"]["strain"], expected)
+    data = one.to_xarray("step-1")
+    np.testing.assert_allclose(data["strain"], expected)
+    assert hl.Actuator.load(beside.parent).zero_length_m == 0.025
+    given = one.to_pandas("step-1", zero_length_m=0.02)["strain"]
+    np.testing.assert_allclose(given["strain"], STRAIN, atol=1e-12)
+    for form, name in (("csv", "csv"), ("mat", "s.mat")):
+        out = tmp_path / name
+        assert code_of("session", "export", beside, "--to", form, "--out", out) == 0
+    exported = np.genfromtxt(tmp_path / "csv" / "step-1-strain.csv", delimiter=",", names=True)
+    np.testing.assert_allclose(exported["strain"][:4], expected[:4], rtol=1e-6)
+    matlab = loadmat(tmp_path / "s.mat", simplify_cells=True)["step_1"]["strain"]
+    np.testing.assert_allclose(matlab["strain"], expected)
+    assert "strain" not in hl.load(session).to_pandas("step-1")["strain"], "no zero length is known"
+
+
+def test_a_zero_length_that_is_none_is_refused(beside):
+    for wrong in (0.0, -1.0, float("nan"), "words", True):
+        with pytest.raises(InputError, match=r"zero_length_m is .*must be a number above 0 m"):
+            hl.load(beside).to_pandas("step-1", zero_length_m=wrong)
+    file = beside.parent / "actuator.toml"
+    file.write_text("[actuator.geometry]\nzero_length_m = -0.1\n")
+    with pytest.raises(InputError, match=r"zero_length_m in \[actuator.geometry\] is -0.1, but"):
+        hl.load(beside).to_xarray("step-1")
 
 
 def test_a_session_as_an_xarray_data_set(session):

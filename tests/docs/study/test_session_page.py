@@ -5,6 +5,7 @@ from __future__ import annotations
 import re
 import shlex
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -24,7 +25,8 @@ COMMANDS = [one for one in ALL if not any(part in one for part in FOREIGN)]
 VOLT, CARRIER_HZ = 3.0517578125e-4, 2000.0
 HEADER = {
     "rig": {"rate_hz": 200e3, "volt_per_code": VOLT, "v_monitor_v_per_v": 2e-4,
-            "i_monitor_v_per_a": 500.0, "skew_s": 0.0, "switch_sample": 0, "block_samples": 2000},
+            "i_monitor_v_per_a": 500.0, "skew_s": 0.0, "switch_sample": 0, "block_samples": 2000,
+            "scale_m_per_px": 2e-4},
     "study": {"sensing": {"carrier_hz": CARRIER_HZ}},
 }  # fmt: skip
 
@@ -43,28 +45,40 @@ def reference(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """A run where the page has one; `DIR` is another name of it."""
     monkeypatch.chdir(tmp_path)
     folder = Path("out/reference")
-    plans = [ExperimentPlan("triangle", "triangle", 1, {})]
+    plans = [
+        ExperimentPlan("triangle", "triangle", 1, {}), ExperimentPlan("pid-1", "steps", 6, {})
+    ]  # fmt: skip
     with (
         Manifest(folder, {}),
         SessionWriter(folder / "session.h5", plans, 2000, HEADER) as session,
     ):
         for k, block in enumerate(monitors(30)):
             session.append_block("triangle", block, 125.0 + 0.01 * k, 1.0, float("nan"))
+        tracks = np.zeros((5, 6), SessionWriter.track_dtype())
+        tracks["y_px"][:, 3:], tracks["valid"] = 103.0, True
+        session.append_block("pid-1", monitors(1)[0], 130.0, 1.0, 0.03)
+        session.append_frames("pid-1", 130.0 + 0.01 * np.arange(5), tracks, 0.0)
+    (folder / "actuator.toml").write_text("[actuator.geometry]\nzero_length_m = 0.02\n")
     Path("DIR").symlink_to(folder)
 
 
 def test_the_page_has_what_is_run_here() -> None:
-    assert (len(PYTHON), len(COMMANDS), len(ALL)) == (4, 5, 8)
+    assert (len(PYTHON), len(COMMANDS), len(ALL)) == (5, 5, 8)
 
 
-@pytest.mark.parametrize("code", PYTHON, ids=["load", "frames", "follow", "xarray"])
+@pytest.mark.parametrize("code", PYTHON, ids=["load", "plot", "frames", "follow", "xarray"])
 def test_each_piece_of_python_runs(code: str) -> None:
     if "xarray" in code:
         pytest.importorskip("xarray")
         pytest.importorskip("h5netcdf")
     if "tables" in code:
         pytest.importorskip("pandas")
-    exec(compile(code, str(PAGE), "exec"), {})
+    names: dict[str, Any] = {}
+    exec(compile(code, str(PAGE), "exec"), names)
+    if "axes" in names:
+        strain, reference = (line.get_ydata() for line in names["axes"].lines)
+        np.testing.assert_allclose(strain, 0.03)  # 103 px of 0.2 mm over 20 mm
+        assert list(reference) == [0.03] and Path("loop.svg").stat().st_size > 0
 
 
 def test_the_commands_run_in_their_order(capsys: pytest.CaptureFixture[str]) -> None:

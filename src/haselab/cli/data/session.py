@@ -58,7 +58,9 @@ def command() -> None:
 )  # fmt: skip
 @shared_option(
     "--zero-length-m", type=Real(1e-6, 10.0),
-    detail="It adds the column strain to each table of strains. Default: none.",
+    detail="The column strain of each table of strains is computed with it. Default: that of an "
+    "imported session, else that of the actuator file beside the session; without any, there is no "
+    "such column.",
 )  # fmt: skip
 @answer_options(
     OutputRule(lambda given: "folder" if given["form"] in FOLDERS else "file"),

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
@@ -9,15 +10,17 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from haselab.base import InputError, is_real, shown, table_at
 from haselab.pipelines.sensing.source import Request, session_config
 from haselab.pipelines.sensing.table import columns_of
 from haselab.runtime.observer import FIDUCIALS
 from haselab.sensing import Lockin
+from haselab.store.actuator_file import ACTUATOR, read_actuator
 from haselab.store.session.layout import ExperimentRecord
 from haselab.store.session.reader import SessionReader
 from haselab.study.fits.observe import gauge_length
 
-__all__ = ["DEFAULT_REQUEST", "derived_series"]
+__all__ = ["DEFAULT_REQUEST", "derived_series", "known_zero_length_m"]
 
 Columns = dict[str, NDArray[Any]]
 _SWITCH, _SCALE, _ZERO = ("rig", "switch_sample"), "scale_m_per_px", ("rig", "zero_length_px")
@@ -41,14 +44,14 @@ def derived_series(
     Args:
         reader: of the session, open.
         experiment: its name.
-        zero_length_m: length at zero strain; adds the column `strain`. None: that of an imported
-            session, if it states one.
+        zero_length_m: length at zero strain, in m, for the column `strain`. None: that of an
+            imported session, else `zero_length_m` of the actuator file beside the session.
     Returns:
         `capacitance` (time_s, capacitance_f, capacitance_std_f, resistance_ohm,
         relative_capacitance, valid; one row per block) if the session states its carrier, and
         `strain` (time_s, length_px, strain_from_start; if the scale is known, length_m; if there
-        are blocks, voltage_v, the mean drive voltage until the next frame; strain; one row per
-        frame) if the frames show both rows of fiducials.
+        are blocks, voltage_v, the mean drive voltage until the next frame; if the zero length is
+        known, strain; one row per frame) if the frames show both rows of fiducials.
     Raises:
         InputError: no such experiment, its data cannot be read, or a zero length for a session
             without scale.
@@ -60,6 +63,30 @@ def derived_series(
     if record.tracks.ndim == 2 and record.tracks.shape[1] == FIDUCIALS and record.tracks.size:
         found["strain"] = _strain(reader, record, zero_length_m)
     return found
+
+
+def known_zero_length_m(session: Path) -> float | None:
+    """`zero_length_m` of the actuator file beside a session, such as that of its run, in m.
+
+    Args:
+        session: path of the session.
+    Returns:
+        The length at zero strain; None: there is no such file, or it does not state one.
+    Raises:
+        InputError: the file cannot be read, or its length is not a positive number.
+    """
+    path = session.parent / ACTUATOR
+    if not path.is_file():
+        return None
+    found = table_at(read_actuator(path), "actuator", "geometry").get("zero_length_m")
+    if found is None:
+        return None
+    if not is_real(found) or not 0.0 < found < math.inf:
+        raise InputError(
+            f"zero_length_m in [actuator.geometry] is {shown(found)}, but must be a positive "
+            f"length in m. Correct it. {path}"
+        )
+    return float(found)
 
 
 def _capacitance(reader: SessionReader, record: ExperimentRecord) -> Columns:
@@ -89,13 +116,16 @@ def _strain(
         delay_s = reader.stated(*_SWITCH) / reader.stated("rig", "rate_hz")
         columns["voltage_v"] = _mean_voltage(record, delay_s)
     columns["length_px"] = length_px
-    if zero_length_m is not None or isinstance(reader.header.get("rig", {}).get(_SCALE), float):
+    scaled = isinstance(reader.header.get("rig", {}).get(_SCALE), float)
+    if zero_length_m is not None or scaled:
         columns["length_m"] = length_px * reader.stated("rig", _SCALE)
     columns["strain_from_start"] = length_px / start_px - 1.0
     if zero_length_m is not None:
         columns["strain"] = columns["length_m"] / zero_length_m - 1.0
     elif reader.states(*_ZERO):  # of an imported strain
         columns["strain"] = length_px / reader.stated(*_ZERO) - 1.0
+    elif scaled and (zero_m := known_zero_length_m(reader.path)) is not None:
+        columns["strain"] = columns["length_m"] / zero_m - 1.0
     return columns
 
 

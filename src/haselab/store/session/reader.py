@@ -91,6 +91,11 @@ class SessionReader(Closing):
             self._file.close()
             self._open()
 
+    @property
+    def path(self) -> Path:
+        """Path of session.h5."""
+        return self._path
+
     def _open(self) -> None:
         try:
             opened = open_session(self._path, unverified=self._unverified)

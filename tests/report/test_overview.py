@@ -38,8 +38,8 @@ def test_the_page_begins_with_what_the_actuator_is_like(written, simulated):
     assert "Damping ratio 0.09000 [0.08929, 0.09071]" in text
     # -4.79 to -4.79 + 4.54 * 2^2 = 13.37, with a noise of 0.05 and a lag at the peak
     assert re.search(r"Strain reach −4\.[89] to 13\.[345] % triangle, 0 to 2 V", text)
-    assert "Final error (% of the step)" in text and re.search(r"PI 2.71\d* — 0.20", text)
-    assert re.search(r"Open loop 7.01\d \d\S* 10.0", text)  # overshoot: of figure 6
+    assert "Final error (% of the step)" in text and re.search(r"PI 2.71\d* \[.*?\] — 0.20", text)
+    assert re.search(r"Open loop 7.01\d \[.*?\] \d\S* 10.0", text)  # overshoot: of figure 6
 
 
 def test_results_stand_in_groups_with_the_main_ones_first(written):
@@ -155,7 +155,11 @@ def test_predicted_steps_stand_beside_the_played_ones(written, documents):
         "overshoot": {"value": 0.0983, "std": 0.0025, "ci95": [0.093, 0.103], "unit": ""},
         "error": {"value": 0.064, "std": 0.0025, "ci95": [0.059, 0.069], "unit": ""},
     }
-    opened = {"overshoot": {"value": 0.5627, "std": 0.0025, "ci95": [0.55, 0.57], "unit": ""}}
+    never = {"value": None, "std": None, "ci95": [None, None], "unit": "s"}
+    opened = {
+        "settling_time_s": never,
+        "overshoot": {"value": 0.5627, "std": 0.0025, "ci95": [0.55, 0.57], "unit": ""},
+    }
     steps["metrics"] = {"open loop": opened, "PI": played}
     steps["predicted"] = {
         "open loop": {"rise_time_s": None, "overshoot": 0.567, "error": -1e-18},
@@ -164,13 +168,32 @@ def test_predicted_steps_stand_beside_the_played_ones(written, documents):
     steps["map_error"] = {"PI": 0.0431}
     page = written(steps=steps).read_text(encoding="utf-8")
     text = _text(page[page.index("<h3>Predicted and played steps") :])
-    assert "Open loop — — 56.7 56.27 — 0 — —" in text
-    assert "PI 3.23 2.8850 0.60 9.83 4.85 4.15 6.40 4.31" in text
+    assert "Open loop — — 56.7 56.27 — not settled 0 — —" in text
+    assert "PI 3.23 2.8850 0.60 9.83 4.85 — 4.15 6.40 4.31" in text
+    assert "Not settled: the strain does not stay within 2 % of the way" in text
     assert "By the strain map: strain sensed by capacitance minus strain by the camera" in text
     # the overshoot of the open loop stands in the table above, too
     short = _text(page[page.index('<section id="summary"') : page.index("<h3>Predicted")])
-    assert re.search(r"Open loop 7\.01\d 56\.27 10\.0", short)
+    assert re.search(r"Open loop 7\.01\d \[.*?, .*?\] 56\.27 10\.0", short)
 
 
-def test_a_folder_without_predictions_has_no_table_of_them(written):
-    assert "Predicted and played" not in written().read_text(encoding="utf-8")
+def test_the_loop_of_the_actuator_file_is_marked_and_rise_times_have_intervals(written):
+    rows = [_row("S25.kp", 0.0), _row("S25.ki", 11.394), _row("S25.rise_pid", 0.1, 0.02)]
+    folder = written(rows).parent
+    for ki, marked in ((11.39, True), (9.0, False)):
+        gains = f"[controller.parameters]\nkp = 0.0\nki = {ki}\n"
+        (folder / "actuator.toml").write_text(f'[controller]\nkind = "pid"\n{gains}')
+        text = _text(write_report(folder).read_text(encoding="utf-8"))
+        mark = " (controller of actuator.toml)" if marked else ""
+        assert f"PID{mark} 0.100 [0.061, 0.139]" in text
+
+
+@pytest.mark.parametrize("modelled", [False, True])
+def test_what_differs_between_the_natural_frequencies_is_said_where_they_are(written, modelled):
+    row = _row("S19.omega_0", 33.22, 3e-4)
+    if modelled:
+        row["direct"] = {"value": 33.22, "std": 0.02, "ci95": [33.18, 33.26], "unit": ""}
+    page = written([row, _row("S20.omega_n", 32.66)]).read_text(encoding="utf-8")
+    text = _text(page[page.index('<section id="results-dynamics"') :])
+    assert "S20 is of the chirp" in text and "another amplitude and another motion" in text
+    assert ("those of the physical model of all experiments together" in text) == modelled

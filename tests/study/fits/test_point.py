@@ -18,6 +18,7 @@ from haselab.study.fits.cycles import Cycles
 from haselab.study.fits.observe import Observation
 from haselab.study.fits.point import find_point
 from haselab.study.fits.static import Static
+from haselab.study.paper.quantity_table import quantities
 
 FREE_M, BLOCK_S, FRAMES_HZ = 0.036, 0.01, 400.0
 SQUARE = 0.03  # stretch per square volt
@@ -87,6 +88,26 @@ def test_the_baseline_is_where_the_stretch_is_the_centre() -> None:
     low, high = point.quantities["S18.strain_min"].value, point.quantities["S18.strain_max"].value
     assert low == pytest.approx(1.35 / stretch_of(1.14) - 1.0, abs=1e-4)
     assert high == pytest.approx(stretch_of(2.0) / stretch_of(1.14) - 1.0, abs=1e-3)
+
+
+@pytest.mark.parametrize("sign", [1.0, -1.0])
+def test_the_voltages_of_the_smallest_and_the_largest_strain_are_stated(sign: float) -> None:
+    """An actuator that contracts has its largest strain at the lowest voltage."""
+    study = builtin_study()
+    seen = triangle(study)
+    length_m = FREE_M * (2.8 * (sign < 0) + sign * stretch_of(seen.ramp_at(seen.seen.frame_time_s)))
+    moved = replace(seen, seen=replace(seen.seen, length_m=length_m))
+    held = [replace(one, length_m=FREE_M * (2.8 * (sign < 0) + sign * stretch_of(one.drive_v)))
+            for one in holds(study)]  # fmt: skip
+    ends = sorted([1.4 + sign * (1.2 - 1.4), 1.4 + sign * (1.5784 - 1.4)])
+    notes = find_point(held, moved, static(*ends), study, RIG).notes
+    volts = [float(notes[f"S18.strain_{end}"].split()[1]) for end in ("min", "max")]
+    low_v, high_v = volts[:: int(sign)]
+    # the staircase of 10 ms reaches both ends to half a step, and a frame is 2.5 ms away
+    assert low_v < 0.02 and high_v > 1.98
+    for end in ("min", "max"):
+        name = quantities()[f"S18.strain_{end}"].name
+        assert "0 V" not in name and "peak" not in name
 
 
 def test_a_centre_out_of_reach_gives_the_nearest_baseline_and_a_weight() -> None:

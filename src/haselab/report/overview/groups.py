@@ -29,6 +29,17 @@ class _Subject:
     main: tuple[str, ...] = ()
 
 
+_FREQUENCIES = ("S20.omega_n", "S20.eq8_omega_n", "S19.omega_0")
+_OF_FREQUENCIES = (
+    "The natural frequencies are those of different motions and definitions, so their intervals "
+    "need not overlap: S20 is of the chirp, with a slow branch (S20.omega_n) or without "
+    "(S20.eq8_omega_n); S19 is of the free response, which has another amplitude and another "
+    "motion before it."
+)
+_OF_MODEL = (
+    " Where a row states a fit of the experiment alone, its value and its much narrower interval "
+    "are those of the physical model of all experiments together."
+)
 _SUBJECTS = (
     _Subject(
         "reach", "Reach, operating point and elasticity", ("S16.", "S17.", "S18."),
@@ -82,12 +93,14 @@ class ResultGroup:
         title: in plain words.
         main: shown at once.
         details: shown when the reader asks for them.
+        note: what a reader has to know to compare the rows; `""`: nothing.
     """
 
     name: str
     title: str
     main: tuple[Quantity, ...]
     details: tuple[Quantity, ...] = ()
+    note: str = ""
 
     @property
     def tables(self) -> tuple[tuple[Quantity, ...], tuple[Quantity, ...]]:
@@ -169,4 +182,8 @@ def _group(subject: _Subject, rows: Sequence[Quantity]) -> ResultGroup:
     name = "results-" + "-".join("".join(c if c.isalnum() else " " for c in subject.name).split())
     if not main or len(details) == 1:  # nothing to unfold, or too little
         main, details = (*main, *details), ()
-    return ResultGroup(name.lower(), subject.title, main, details)
+    note = ""
+    if sum(key in by_id for key in _FREQUENCIES) > 1:
+        modelled = any(row.direct is not None for row in rows)
+        note = _OF_FREQUENCIES + (_OF_MODEL if modelled else "")
+    return ResultGroup(name.lower(), subject.title, main, details, note)

@@ -7,15 +7,25 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Any
 
+from haselab.base import is_real, table_at
 from haselab.report.analysis import LeftOutError, Section
 from haselab.report.folder import RunFolder
 from haselab.report.numbers import ABSENT, interval_text
 from haselab.report.overview.facts import rounded
 from haselab.report.results import Quantity, Results
+from haselab.store.actuator_file import ACTUATOR, read_actuator
 
 __all__ = ["LoopTable", "loop_table", "prediction_table"]
 
 _PERCENT = 100.0
+_SAME_GAIN = 0.01
+_OF_FILE = " (controller of actuator.toml)"
+_SETTLING, _UNSETTLED = "settling_time_s", "not settled"
+_NOTE_UNSETTLED = (
+    "Not settled: the strain does not stay within 2 % of the way around the final strain before "
+    "the last tenth of the record begins, because of creep, ringing or noise, so there is no "
+    "settling time."
+)
 
 
 @dataclass(frozen=True)
@@ -66,7 +76,7 @@ _LOOPS = {
 _COMPARED = (
     ("Rise time 10–90 % (s)", "rise_time_s", 1.0),
     ("Overshoot (% of the step)", "overshoot", _PERCENT),
-    ("Settling time (s)", "settling_time_s", 1.0),
+    ("Settling time (s)", _SETTLING, 1.0),
     ("Final error (% of the step)", "error", _PERCENT),
 )
 _OF_MAP = "Final error by the strain map (% of the step)"
@@ -91,7 +101,8 @@ def loop_table(run: RunFolder) -> LoopTable | None:
     loop = _section(run, "loop")
     for name, keys in _LOOPS.items():
         cells = [
-            _cell(results.get(key), factor) for key, (_, factor) in zip(keys, _CELLS, strict=True)
+            _cell(results.get(key), factor, interval=at < _OF_TRIAL)
+            for at, (key, (_, factor)) in enumerate(zip(keys, _CELLS, strict=True))
         ]
         if name == _OPEN:
             cells[1] = _played(run, "open loop", "overshoot", _PERCENT)
@@ -101,7 +112,8 @@ def loop_table(run: RunFolder) -> LoopTable | None:
         worst = [_number(loop, f"controllers.{name}.{key}") for _, key in _WORST]
         # each worst margin stands beside its nominal one
         ordered = (*cells[:4], worst[0], cells[4], worst[1])
-        found[name.format(kind=_own_kind(results)) + played] = ordered
+        mark = _OF_FILE if name == _loop_of_file(run) else ""
+        found[name.format(kind=_own_kind(results)) + played + mark] = ordered
     heads = [head for head, _ in _CELLS]
     columns = (*heads[:4], _WORST[0][0], heads[4], _WORST[1][0])
     used = [at for at in range(len(columns)) if any(row[at] != ABSENT for row in found.values())]
@@ -128,6 +140,9 @@ def prediction_table(run: RunFolder) -> LoopTable | None:
         cells: list[str] = []
         for _, key, factor in _COMPARED:
             cells += [_number(predicted, key, factor), _played(run, name, key, factor)]
+            if key == _SETTLING:
+                tables = _raw(run, "predicted", name), _raw(run, "metrics", name).get(key)
+                cells[-2:] = map(_or_unsettled, cells[-2:], (key, "value"), tables)
         cells.append(_number(steps, f"map_error.{name}", _PERCENT))
         rows.append((name[0].upper() + name[1:], tuple(cells)))
     columns = [f"{head}: {which}" for head, _, _ in _COMPARED for which in ("predicted", "played")]
@@ -135,11 +150,29 @@ def prediction_table(run: RunFolder) -> LoopTable | None:
     used = [at for at in range(len(columns)) if any(cells[at] != ABSENT for _, cells in rows)]
     if not used:
         return None
+    with_map = _OF_MAP in (columns[at] for at in used)
+    notes = _PREDICTION_NOTES if with_map else _PREDICTION_NOTES[:1]
+    if any(_UNSETTLED in cells for _, cells in rows):
+        notes = (*notes, _NOTE_UNSETTLED)
     return LoopTable(
         tuple(columns[at] for at in used),
         tuple((name, tuple(cells[at] for at in used)) for name, cells in rows),
-        _PREDICTION_NOTES if _OF_MAP in (columns[at] for at in used) else _PREDICTION_NOTES[:1],
+        notes,
     )
+
+
+def _raw(run: RunFolder, table: str, name: str) -> Mapping[str, Any]:
+    """A table of a loop in the section `steps` of analysis.json; empty if there is none."""
+    found: Any = run.analysis.get("steps")
+    for key in (table, name):
+        found = found.get(key) if isinstance(found, Mapping) else None
+    return found if isinstance(found, Mapping) else {}
+
+
+def _or_unsettled(cell: str, key: str, table: Any) -> str:
+    """The cell; a number that is not known, written as null, was not reached."""
+    unknown = isinstance(table, Mapping) and key in table and table[key] is None
+    return _UNSETTLED if cell == ABSENT and unknown else cell
 
 
 def _section(run: RunFolder, name: str) -> Section | None:
@@ -217,5 +250,29 @@ def _own_kind(results: Results) -> str:
     return f"'{kind}'" if kind else "of [control] kind"
 
 
-def _cell(row: Quantity | None, factor: float) -> str:
-    return ABSENT if row is None or row.measured is None else rounded(row, factor)[0]
+def _cell(row: Quantity | None, factor: float, *, interval: bool) -> str:
+    if row is None or row.measured is None:
+        return ABSENT
+    value, ends = rounded(row, factor)
+    return f"{value} {ends}" if interval and ends != ABSENT else value
+
+
+def _loop_of_file(run: RunFolder) -> str:
+    """The loop whose controller is that of the folder's actuator file; `""` if none is."""
+    path = run.path / ACTUATOR
+    if not path.is_file():
+        return ""
+    section = table_at(read_actuator(path), "controller")
+    kind, gains = section.get("kind"), table_at(section, "parameters")
+    row, name = {"pid": ("S25", "PID"), "pi": ("S21", "PI")}.get(str(kind), ("", ""))
+    if not row:
+        own = "Controller {kind}"
+        return own if kind and _own_kind(run.results) == f"'{kind}'" else ""
+    for gain in ("kp", "ki"):
+        used, written = run.results.get(f"{row}.{gain}"), gains.get(gain)
+        if used is None or used.measured is None or not is_real(written):
+            return ""
+        # of a later design, the gains differ
+        if not math.isclose(used.measured.value, written, rel_tol=_SAME_GAIN, abs_tol=1e-9):
+            return ""
+    return name

@@ -149,6 +149,11 @@ def find_point(
     zero_m = cycles.length_at(played_v)
     finest = np.sqrt(2.0) * POSITION_PX * rig.scale_m_per_px / zero_m
     lengths_m = cycles.seen.length_m[cycles.kept]
+    for end, at in (("min", int(lengths_m.argmin())), ("max", int(lengths_m.argmax()))):
+        time_s = float(cycles.seen.frame_time_s[cycles.kept][at])
+        notes[f"S18.strain_{end}"] = (
+            f"at {cycles.ramp_at(np.array([time_s]))[0]:.3g} V of the drive"
+        )
     inside = region.low.value <= stretch <= region.high.value
     notes["S18.centre_offset"] = (
         f"stretch {stretch:.3f}, {'inside' if inside else 'outside'} the longest linear region of "

@@ -119,11 +119,11 @@ def _sensing() -> dict[str, Quantity]:
             "residual strain after the first cycle", "", paper_note="paper: never returns to zero"
         ),
         "S13.peak_drift": Quantity(
-            "peak strain, last cycle minus second",
+            "strain farthest from the start of its cycle, last cycle minus first one used",
             "",
             paper_note="paper: cycles 2 to 5 are repeatable",
         ),
-        "S13.residual_drift": Quantity("residual strain, last cycle minus second", ""),
+        "S13.residual_drift": Quantity("residual strain, last cycle minus first one used", ""),
         "S14.a1": Quantity("voltage map, a1", "V", 1.324, paper_note=trade),
         "S14.b1": Quantity("voltage map, b1", "", 3.124, paper_note=trade),
         "S14.a2": Quantity("voltage map, a2", "V", -0.2805, paper_note=trade),
@@ -177,16 +177,16 @@ def _statics() -> dict[str, Quantity]:
             note="zero strain is the mean length of the triangle's edges at that voltage",
         ),
         "S18.strain_min": Quantity(
-            "strain at 0 V in the triangle",
+            "smallest strain in the triangle",
             "",
             recomputed=loop["at_low"],
-            paper_note="recomputed: eq. 4",
+            paper_note="recomputed: eq. 4 at 0 V",
         ),
         "S18.strain_max": Quantity(
-            "strain at the triangle's peak",
+            "largest strain in the triangle",
             "",
             recomputed=loop["at_high"],
-            paper_note="recomputed: eq. 4",
+            paper_note="recomputed: eq. 4 at 2 V",
         ),
     }
 

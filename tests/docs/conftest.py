@@ -52,7 +52,7 @@ def make_shell(tmp_path_factory: pytest.TempPathFactory) -> Callable[..., Shell]
 
     def make(name: str, *packages: Path) -> Shell:
         folder = tmp_path_factory.mktemp(name)
-        (folder / "twin.toml").write_text('kind = "twin"\n')
+        (folder / "rig.toml").write_text('kind = "twin"\n')
         for package in packages:
             ignore = shutil.ignore_patterns("__pycache__", "build", "*.egg-info")
             shutil.copytree(package, folder / package.relative_to(_ROOT), ignore=ignore)

@@ -7,7 +7,9 @@ import numpy as np
 import pytest
 from matplotlib.figure import Figure
 
+from haselab.report.analysis import Section
 from haselab.report.figures import PLANS, draw_figure
+from haselab.report.figures.chip import draw_loops
 from haselab.report.folder import RunFolder, read_folder
 from haselab.report.results import Results
 from haselab.report.style import figure_style
@@ -231,3 +233,17 @@ def test_a_name_from_the_file_is_shown_unchanged(run):
     groups["_costs $1 & $2"] = groups.pop("PI")
     drawing = draw_figure(plan_of("fig6"), RunFolder(run.path, run.results, analysis))
     assert "_costs $1 &amp; $2, camera" in drawing.document
+
+
+def test_a_loop_that_does_not_settle_leaves_no_part_of_its_figure_empty():
+    """A strain that leaves its band until the end; the axis went to 2.5 times the record."""
+    time_s = np.linspace(-2.0, 6.0, 400)
+    never = np.where(time_s > 0.0, 0.03, 0.0) + 0.01 * np.sin(5.0 * time_s)
+    section = Section("chip", {
+        "desired": {"time_s": time_s, "strain": np.where(time_s > 0.0, 0.03, 0.0)},
+        "loops": {"chip, 1000 Hz": {"time_s": time_s, "strain": never}},
+    })  # fmt: skip
+    figure = Figure()
+    draw_loops(figure, section)
+    low, high = figure.axes[0].get_xlim()
+    assert low >= -2.0 and high == pytest.approx(6.0)

@@ -10,7 +10,7 @@ from haselab.store.source_commit import source_commit
 
 def test_date_and_duration_are_those_of_the_manifest() -> None:
     manifest = {"opened": "2026-01-02T03:04:05.6+00:00", "closed": "2026-01-02T03:05:05.9+00:00"}
-    assert recorded_when(manifest) == {"date": "2026-01-02T03:04:05+00:00", "duration_s": 60.3}
+    assert recorded_when(manifest) == {"date": "2026-01-02T03:04:05+00:00", "wall_time_s": 60.3}
 
 
 def test_an_older_or_broken_manifest_says_what_it_can() -> None:

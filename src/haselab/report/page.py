@@ -18,7 +18,7 @@ from haselab.report.overview.facts import facts
 from haselab.report.overview.groups import is_empty, result_groups
 from haselab.report.overview.loops import loop_table, prediction_table
 from haselab.report.overview.summary import summary_text
-from haselab.report.results import Results
+from haselab.report.results import Results, named_ids
 from haselab.store.claim import refuse_linked_folders
 from haselab.store.folder import write_text
 
@@ -200,6 +200,7 @@ def _template() -> jinja2.Template:
         autoescape=True, trim_blocks=True, lstrip_blocks=True, undefined=jinja2.StrictUndefined
     )
     environment.filters["value"] = value_text
+    environment.filters["named_ids"] = named_ids
     environment.filters["tone"] = _tone
     environment.filters["row"] = _row
     return environment.from_string(_packaged("run.html.j2"))

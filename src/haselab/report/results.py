@@ -3,17 +3,36 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from typing import Any
 
 from haselab.base import Estimate, InputError
 from haselab.report.numbers import interval_text, value_text
 
-__all__ = ["VERDICTS", "Quantity", "Results"]
+__all__ = ["VERDICTS", "Quantity", "Results", "named_ids"]
 
 VERDICTS = ("agrees", "disagrees", "inconclusive")
+_MOST_IDS, _FIRST_IDS = 8, 3  # that are named with one reason
 _NOWHERE = (math.nan, math.nan)
+
+
+def named_ids(ids: Sequence[str]) -> str:
+    """Name results that a run does not have; of many with one reason, only the first.
+
+    Args:
+        ids: of the results; results.json has all of them.
+
+    Returns:
+        One line.
+
+    Example:
+        >>> named_ids(["a", "b"]), named_ids([*"abcdefghij"])
+        ('a, b', 'a, b, c and 7 more')
+    """
+    if len(ids) <= _MOST_IDS:
+        return ", ".join(ids)
+    return f"{', '.join(ids[:_FIRST_IDS])} and {len(ids) - _FIRST_IDS} more"
 
 
 @dataclass(frozen=True)

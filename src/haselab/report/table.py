@@ -8,7 +8,7 @@ from typing import Any
 
 from haselab.report.numbers import value_text
 from haselab.report.overview.summary import counted, verdict_counts
-from haselab.report.results import Quantity, Results
+from haselab.report.results import Quantity, Results, named_ids
 
 __all__ = ["results_table"]
 
@@ -167,7 +167,7 @@ def _missing(results: Results, columns: int) -> list[str]:
     lines = []
     for ids, reason in results.not_played:
         lines += textwrap.wrap(
-            f"no result: {', '.join(ids)}: {reason}", columns, subsequent_indent="  ",
+            f"no result: {named_ids(ids)}: {reason}", columns, subsequent_indent="  ",
             break_long_words=False, break_on_hyphens=False,
         )  # fmt: skip
     return lines

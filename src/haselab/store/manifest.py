@@ -101,14 +101,16 @@ def recorded_when(manifest: Mapping[str, Any]) -> dict[str, object]:
     Args:
         manifest: of its folder.
     Returns:
-        `date` of its beginning and `duration_s`, each where the manifest says it.
+        `date` of its beginning and `wall_time_s`, the time between its beginning and its end by the
+        clock of the computer, each where the manifest says it. A simulated bench may be faster than
+        the time of its bench.
     """
     found: dict[str, object] = {}
     try:
         opened = datetime.fromisoformat(str(manifest["opened"]))
         found["date"] = opened.isoformat(timespec="seconds")
         closed = datetime.fromisoformat(str(manifest["closed"]))
-        found["duration_s"] = round((closed - opened).total_seconds(), 1)
+        found["wall_time_s"] = round((closed - opened).total_seconds(), 1)
     except (KeyError, ValueError, TypeError):
         pass  # an older recording, or one that was cut off
     return found

@@ -80,7 +80,7 @@ def test_the_study_of_the_page_plays_its_controller_alone(lab) -> None:
 @pytest.mark.slow
 def test_the_commands_of_the_page_do_what_it_says(lab) -> None:
     has_chip = shutil.which("avr-gcc") is not None and simavr_header() is not None
-    wanted = lab.run(f"haselab run {PACKAGE}/study.toml --rig twin.toml --out out/none")
+    wanted = lab.run(f"haselab run {PACKAGE}/study.toml --rig rig.toml --out out/none")
     assert wanted.returncode == 2
     assert "Use one of open-loop, pi, pid, " in wanted.stderr
     assert ", or install the package" in wanted.stderr

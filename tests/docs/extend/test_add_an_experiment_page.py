@@ -22,7 +22,7 @@ STUDY = re.search(r"```toml\n(name = .*?)```", TEXT, re.DOTALL)
 def lab(make_shell):
     made = make_shell("experiment", PACKAGE)
     before = made.run("haselab plan feasibility examples/plugins/haselab-myexperiment/creep.toml "
-                      "--rig twin.toml")  # fmt: skip
+                      "--rig rig.toml")  # fmt: skip
     assert before.returncode == 2 and "[creep]" in before.stderr, before.stderr
     for command in COMMANDS:
         done = made.run(command)
@@ -82,7 +82,7 @@ def test_a_drive_that_was_not_declared_stops_the_run(lab) -> None:
     )
     assert changed != source
     (module / "__init__.py").write_text(changed)
-    done = lab.run("haselab run haselab-myexperiment/creep.toml --rig twin.toml --out out/more")
+    done = lab.run("haselab run haselab-myexperiment/creep.toml --rig rig.toml --out out/more")
     (module / "__init__.py").write_text(source)
     assert done.returncode == 2
     assert "declares drives of 0 to 1.5 V, but plays 1.8 V" in done.stderr

@@ -19,6 +19,7 @@ from haselab.study.simulated.agreement import (
     StepCase,
     agreement_of,
     check_stable,
+    largest_noise,
     predicted_loop,
     tolerance,
 )
@@ -73,6 +74,23 @@ def test_the_prediction_comes_to_rest_at_the_reference() -> None:
     assert np.abs(expected.strain[(at_s > -1.0) & (at_s < 0.0)]).max() < 1e-3
     assert np.abs(expected.strain[at_s > 3.0] - 0.04).max() < 1e-3
     assert case.deviation(expected, expected) == 0.0
+
+
+def test_the_tolerated_noise_holds_for_other_noise_and_for_each_length() -> None:
+    """The largest of 30 other noises stays below it; that of one drawn noise did not."""
+    case = case_of(twin_of_reading("hz"))
+    for before_s, after_s in ((6.0, 4.0), (4.0, 1.5)):
+        short = replace(case, plan=replace(case.plan, hold_s=before_s, last_s=after_s))
+        run = played(short)
+        quiet = predicted_loop(run, short)
+        drawn, tolerated = [], []
+        for seed in range(30 if before_s == 4.0 else 3):
+            other = replace(short, seed=seed)
+            drawn.append(other.deviation(predicted_loop(run, other, noise=True), quiet))
+            tolerated.append(largest_noise(run, other))
+        assert max(drawn) < min(tolerated)
+        assert drawn[0] < max(drawn), "one drawn noise is no bound"
+        assert max(tolerated) < 1.3 * min(tolerated)
 
 
 def test_a_twin_that_softens_in_the_step_is_named() -> None:

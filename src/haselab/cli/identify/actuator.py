@@ -159,7 +159,8 @@ def _shorter(fit: ActuatorFit) -> JsonObject:
     """One line for each parameter, linear model and law, in place of tables."""
     return {
         "determined_by": {
-            "xN": "without this signal, N times the variance",
+            "xN": "without this signal, the variance of the parameter is N times as large",
+            "known beforehand": "what is assumed of camera and sensing, not the start values",
             **{
                 name: ", ".join(f"{each.text} x{each.variance_growth:.3g}" for each in sources)
                 for name, sources in fit.determined_by.items()

@@ -106,7 +106,7 @@ def _of_manifest(folder: Path, version: tuple[int, int, int]) -> dict[str, Any]:
         "name": folder.name,
         "study": str(study.get("name", "")) if isinstance(study, dict) else "",
         "opened": str(manifest.get("opened", "")),
-        "seconds": when.get("duration_s"),
+        "seconds": when.get("wall_time_s"),
         "state": state,
         "open": manifest.get("state") == "OPEN",
     }

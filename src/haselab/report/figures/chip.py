@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping
 
 import numpy as np
@@ -31,7 +32,7 @@ def draw_loops(host: FigureBase, section: Section) -> None:
     if not loops:
         raise LeftOutError(f"'{section.name}' in analysis.json has no 'loops'.")
     axes = host.subplots()
-    settled_s = 0.0
+    settled_s, first_s, last_s = 0.0, math.inf, -math.inf
     for name, data, colour, width in [
         ("desired", section.section("desired"), GREEN, 1.8),
         *((name, loop, PALETTE[k % len(PALETTE)], 1.2) for k, (name, loop) in
@@ -42,8 +43,9 @@ def draw_loops(host: FigureBase, section: Section) -> None:
         step = thinned(time_s.size, _SAMPLES_DRAWN)
         axes.plot(time_s[step], strain[step], color=colour, linewidth=width, label=label_text(name))
         settled_s = max(settled_s, _settled_s(time_s, strain))
-    if settled_s > 0.0:
-        axes.set_xlim(-0.25 * settled_s, 2.5 * settled_s)
+        first_s, last_s = min(first_s, time_s[0]), max(last_s, time_s[-1])
+    if settled_s > 0.0:  # a loop that does not settle must not leave half of the figure empty
+        axes.set_xlim(max(-0.25 * settled_s, first_s), min(2.5 * settled_s, last_s))
     axes.set_xlabel("Time (s)")
     axes.set_ylabel("Strain (%)")
     legend_below(host, axes, 4)

@@ -234,7 +234,7 @@ def test_the_summary_names_the_own_controller_of_a_study(make_run, documents):
          "ci95": [0.008, 0.012], "unit": ""}},
     ]  # fmt: skip
     found = write_report(make_run(results, analysis)).read_text(encoding="utf-8")
-    assert ["Controller 'leaky'", "—", "—", "1.00"] in Reader(found).rows
+    assert ["Controller 'leaky'", "—", "—", "1.00 [0.80, 1.20]"] in Reader(found).rows
     assert '<li class="missing">S25.rise_own (S25.rise_own): no value: no rise; more</li>' in found
     text = results_table(results)
     assert "\nS25.rise_own has no value: no rise\n" in text

@@ -41,4 +41,4 @@ def test_a_named_pipe_in_a_recording_keeps_no_page_waiting(tmp_path: Path) -> No
     assert (one["note"], one["report"]) == ("", False)
     assert "named pipe" in one["state"]
     assert "no report of run yet" in no_report
-    assert "no results that can be read" in no_results
+    assert "named pipe" in no_results and "press Analyse" in no_results

@@ -253,6 +253,7 @@ def compare(files: PanelFiles, values: JsonObject) -> JsonObject:
     try:
         found = compare_results(first, second)
     except InputError as error:
-        raise InputError(f"{error} On this page, press Analyse.") from None
+        reason = str(error).rstrip(".")
+        raise InputError(f"{reason}. On this page, press Analyse.") from None
     rows: list[Json] = [to_plain(row.to_dict()) for row in found.rows]
     return {"rows": rows, "limit": found.limit_deviations, "notes": list(found.notes)}

@@ -159,6 +159,8 @@ def test_a_file_that_changed_is_shown_before_it_is_written(page: Page, path: Pat
     said = page.get_by_text("the actuator file has changed since")
     expect(said).to_be_visible(timeout=WAIT_MS)
     expect_margins_of(page, path)
+    page.get_by_role("button", name="Read the file again").click()
+    expect(page.get_by_text("The file has changed since this page")).to_have_count(0)
     page.get_by_role("button", name="Write to the actuator file").click()
     expect(page.get_by_text("Written to")).to_be_visible(timeout=WAIT_MS)
 
@@ -196,7 +198,7 @@ def test_without_an_actuator_file_the_page_says_how_to_start(
 
 
 def test_gains_that_another_program_wrote_are_not_reverted(page: Page, path: Path) -> None:
-    path.write_text(path.read_text().replace("ki = ", "ki = 0.1 # "))
+    path.write_text(path.read_text().replace("ki = 5.0", "ki = 0.1"))
     typed(page, "Derivative gain").fill("0.011")
     page.keyboard.press("Enter")
     said = page.get_by_text("The file has changed since this page read it.")
@@ -213,7 +215,7 @@ def test_gains_that_another_program_wrote_are_not_reverted(page: Page, path: Pat
 
 
 def test_the_step_is_shown_until_a_slow_loop_settles(path: Path) -> None:
-    for ki, longest_s in ((2.0, 10.0), (0.3, 30.0)):
+    for ki in (2.0, 0.3):  # before, 2 s and 10 s were shown, in which the output reached 0.6 of it
         step = ask(path, "design-loop", **{**GAINS, "kp": 0.0, "kd": 0.0, "ki": ki})["step"]
         late = abs(step["measured"][-1] - step["reference"][-1])
-        assert late < 0.05 * abs(step["reference"][-1]) and step["time_s"][-1] <= longest_s
+        assert late < 0.02 * abs(step["reference"][-1])

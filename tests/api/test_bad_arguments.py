@@ -195,7 +195,8 @@ CALLS = {
             "plant",
             "physical",
         )
-    },
+    }
+    | {"zero_length_m": (None, without(POSITIVE, "nothing"))},
     hl.Actuator.load: {"path": ("no.toml", {**PATH, "folder": "."})},
     hl.Plant: {
         "gain": (1.0, NOT_A_NUMBER),

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
@@ -110,6 +111,10 @@ class Actuator:
 
     def __post_init__(self) -> None:
         check_fields(self)
+        if self.zero_length_m is not None and not 0.0 < self.zero_length_m < math.inf:
+            raise InputError(
+                f"zero_length_m is {self.zero_length_m:g}; it must be above 0 m and finite."
+            )
 
     @classmethod
     @checked

@@ -210,7 +210,7 @@ def test_what_cannot_be_read_is_refused(actuator, tmp_path, capsys, options, wor
         names += ("--output", "length_m")
     code, _, error = run(capsys, file, "--actuator", actuator, *names, *options)
     assert code == 2 and words in error, error
-    assert error.splitlines()[0].endswith("was converted from mV to V. " + str(file)) or (
+    assert error.splitlines()[0].endswith(f"was converted from mV to V. File: {file}") or (
         error.count("\n") == 1
     )
 

@@ -199,7 +199,7 @@ LOAD_TASKS = (
             Metric("mass_error", "", "relative error of the estimated weight after 4 s",
                    _WEIGHT_LIMIT),
             Metric("rise_s", "s", "rise time of a step of 4 % strain with this weight", RISE.limit),
-            Metric("overshoot", "", "overshoot of this step, over the step"),
+            Metric("overshoot", "", "overshoot of this step, as a fraction of the step"),
             Metric("peak_field_v_per_m", "V/m", "largest field"),
         ),
         _weights, _score_weights, _bounds_weights,

@@ -33,7 +33,7 @@ _FASTEST = (
 )
 RISE = Metric("rise_s", "s", "rise time (10 to 90 %) of a step of 4 % strain at strain 0", _FASTEST)
 OVERSHOOT = Metric(
-    "overshoot", "", "overshoot of this step beyond the desired strain, over the step"
+    "overshoot", "", "overshoot of this step beyond the desired strain, as a fraction of the step"
 )
 SETTLING = Metric(
     "settling_s", "s",
@@ -44,8 +44,13 @@ _ALL = (
     OVERSHOOT,
     SETTLING,
     Metric("rise_from_zero_s", "s", "rise time of a step of 14 % strain from 0 V", _FASTEST),
-    Metric("worst_overshoot", "", "largest overshoot of all steps, over the step"),
-    Metric("iae", "s", "integral of the absolute error over the step, mean of all steps"),
+    Metric("worst_overshoot", "", "largest overshoot of all steps, as a fraction of the step"),
+    Metric(
+        "iae",
+        "s",
+        "integral of the absolute error during a step, divided by the size of the step; "
+        "mean of all steps",
+    ),
     Metric("drive_variation_v_per_s", "V/s", "sum of the changes of the drive, per second"),
     Metric("peak_field_v_per_m", "V/m", "largest field"),
 )

@@ -159,7 +159,7 @@ TRACKING_TASKS = (
                    "the median of the largest of all stairs"),
             Metric("noise_at_rest", "",
                    "standard deviation at the end of a stair, median of all (strain)"),
-            Metric("overshoot", "", "largest overshoot of all stairs, over the stair"),
+            Metric("overshoot", "", "largest overshoot of all stairs, as a fraction of the stair"),
             Metric("peak_field_v_per_m", "V/m", "largest field"),
         ),
         _staircase, _score_staircase, _bounds_staircase,

@@ -96,12 +96,13 @@ def command(
     the output to 0 V and ends the panel.
     """
     with contextlib.ExitStack() as opened:
+        example = None
         if rig is None:
             folder = Path(opened.enter_context(tempfile.TemporaryDirectory()))
             rig = folder / "twin.toml"
             write_new(rig, 'kind = "twin"\n')
             if actuator is None:
-                actuator = _twin_actuator(runs)
+                actuator = example = _twin_actuator(runs)
         panel = opened.enter_context(
             running_panel(PanelFiles(rig, actuator, runs), page_port, lease_s, lan)
         )
@@ -111,6 +112,8 @@ def command(
         click.echo(
             f"haselab: Open this address in a browser{also}. Ctrl-C ends the panel.{lent}", err=True
         )
+        if example is not None:
+            click.echo(f"haselab: The actuator file of this twin is {example}.", err=True)
         if not no_browser:
             webbrowser.open(panel.addresses[0])
         _serve(panel)
@@ -128,7 +131,6 @@ def _twin_actuator(runs: Path) -> Path:
             write_text(path, reference_actuator())
         except DeviceError as error:
             raise DeviceError(f"{error} Or name another folder with --runs.") from None
-    click.echo(f"haselab: The actuator file of this twin is {path}.", err=True)
     return path
 
 

@@ -47,9 +47,6 @@ def find_distortion(
     carriers = np.stack([voltage, current], axis=1)
     size = np.maximum(np.abs(carriers), 1e-300)
     harmonic = harmonic * np.conj(carriers / size)[:, :, np.newaxis] ** orders
-    # A block of few segments can estimate a noise far below the true one by chance, so that noise
-    # looks like a clear harmonic. Blocks of one record have about the same noise.
-    std = np.maximum(std, np.median(std, axis=0))
     single = _saturates(harmonic, _beyond_load(harmonic, carriers, orders), std)
     seen = (np.abs(harmonic) > _CLEAR * std).any(axis=(1, 2))
     if apart.all():

@@ -170,6 +170,7 @@ export default function Design({ link, state }) {
     else {
       unwritten = null;
       see({ ...about, sha256: answer.sha256 });
+      find((last) => ({ ...last, sha256: answer.sha256 })); // or it would look changed until the next answer
       const next = state?.holder ? "The armed bench keeps its present controller. Disarm it and arm it again to use the new one." : "Press Arm the bench on the page Live to use it.";
       say({ text: `Written to ${answer.written}. ${next}`, bad: false });
     }

@@ -84,7 +84,7 @@ def known_zero_length_m(session: Path) -> float | None:
     if not is_real(found) or not 0.0 < found < math.inf:
         raise InputError(
             f"zero_length_m in [actuator.geometry] is {shown(found)}, but must be a positive "
-            f"length in m. Correct it. {path}"
+            f"length in m. Write one, or remove the key. {path}"
         )
     return float(found)
 

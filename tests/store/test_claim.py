@@ -187,30 +187,32 @@ def test_a_link_that_leads_nowhere_is_bad_input_with_its_cause(tmp_path):
     link.symlink_to("missing")
     with pytest.raises(InputError, match="--out is a link to missing, which does not exist"):
         claimed_folder(link).__enter__()
-    with pytest.raises(InputError, match="Cannot create this path"):
+    with pytest.raises(InputError, match=r"Cannot write \(.*Part of the path is a file"):
         claimed_folder(link / "below").__enter__()
     with claimed_folder(link, force=True) as aside:
         assert aside is not None and aside.is_symlink() and link.is_dir()
 
 
 @pytest.mark.parametrize(
-    ("number", "kind"),
+    ("number", "kind", "remedy"),
     [
-        (errno.ENOENT, InputError),
-        (errno.EACCES, InputError),
-        (errno.EROFS, InputError),
-        (errno.ENOSPC, DeviceError),
-        (errno.EIO, DeviceError),
+        (errno.ENOENT, InputError, "Choose another folder, or change its permissions"),
+        (errno.EACCES, InputError, "Choose another folder, or change its permissions"),
+        (errno.EROFS, InputError, "Choose another folder, or change its permissions"),
+        (errno.ENOTDIR, InputError, "Part of the path is a file"),
+        (errno.ENOSPC, DeviceError, "Free disk space"),
+        (errno.EIO, DeviceError, "Check the disk"),
     ],
 )
 def test_a_place_without_permission_is_bad_input_and_a_failing_disk_is_not(
-    tmp_path, monkeypatch, number, kind
+    tmp_path, monkeypatch, number, kind, remedy
 ):
     def refuse(*_, **__):
         raise OSError(number, os.strerror(number))
 
     monkeypatch.setattr(Path, "open", refuse)
-    with pytest.raises(kind, match=rf"Cannot write \({os.strerror(number)}\)\..*a\.toml$"):
+    line = rf"^Cannot write \({os.strerror(number)}\)\. {remedy}.*a\.toml$"
+    with pytest.raises(kind, match=line):
         create_exclusively(tmp_path / "a.toml")
 
 

@@ -11,11 +11,11 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from haselab.base import DeviceError, InputError, Json, JsonObject
+from haselab.base import InputError, Json, JsonObject
 from haselab.campaign.definition import Campaign
 from haselab.campaign.plan import Plan
 from haselab.store.campaign.shards import CaseRow, Shards
-from haselab.store.claim import is_occupied
+from haselab.store.claim import is_occupied, not_written
 from haselab.store.folder import drafted, json_text, read_json, write_new, write_text
 from haselab.store.optional import library
 
@@ -90,9 +90,7 @@ def _save_design(plan: Plan, path: Path) -> None:
         with drafted(path) as draft:
             np.save(draft, plan.drawn)
     except OSError as error:
-        raise DeviceError(
-            f"Cannot write ({error.strerror or error}). Free disk space. {path}"
-        ) from None
+        raise not_written(path, error) from None
 
 
 def changes_of(old: Json, new: Json, path: str = "") -> list[str]:
@@ -168,9 +166,7 @@ def write_table(plan: Plan, rows: Sequence[CaseRow], folder: Path) -> None:
                 write_page_checksum=True,
             )  # fmt: skip
     except OSError as error:
-        raise DeviceError(
-            f"Cannot write ({error.strerror or error}). Free disk space. {folder / TABLE}"
-        ) from None
+        raise not_written(folder / TABLE, error) from None
     write_text(folder / FAILED, "\n".join(_failures(rows)))
 
 

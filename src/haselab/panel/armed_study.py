@@ -4,13 +4,13 @@ from __future__ import annotations
 
 import threading
 import time
-from pathlib import Path
 
 from haselab.base import HaselabError, described
 from haselab.panel.page_leases import PageLeases
 from haselab.panel.pages.study_job import StudyJob
 from haselab.panel.study_player import PictureFile, StudyPlayer
 from haselab.safety.guarded import GuardedRig
+from haselab.store.claim import not_written
 
 __all__ = ["CHECK", "ArmedStudy"]
 
@@ -82,7 +82,7 @@ class ArmedStudy:
             kept = f" The data recorded so far are in {folder}." if is_kept else ""
             return f"{error}{kept}"
         except OSError as error:
-            return self._tripped(_unwritable(error, folder))
+            return self._tripped(str(not_written(folder, error, "The recording cannot be written")))
         except Exception as error:  # of a driver, for example if STOP interrupts its call
             return self._tripped(f"A driver or an experiment failed: {described(error)}. {CHECK}")
         finally:
@@ -110,8 +110,3 @@ class ArmedStudy:
                 f"No message for {self._leases.lease_s:g} s from the page that started the study."
             )
         return self._end
-
-
-def _unwritable(error: OSError, folder: Path) -> str:
-    """Say that the recording cannot be written, why, and where."""
-    return f"The recording cannot be written ({error.strerror}). Check the folder. {folder}"

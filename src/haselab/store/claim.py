@@ -23,6 +23,7 @@ __all__ = [
     "is_occupied",
     "joined_folder",
     "move_aside",
+    "not_written",
     "refuse_linked_folders",
     "shared_folder",
 ]
@@ -32,21 +33,34 @@ _AGE_S = 1.0  # of an empty file, after which the program that created it has lo
 _LOG = "guardian.log"  # only appended to, by any program
 _BAD_PATH = (errno.EEXIST, errno.ENOTDIR, errno.EISDIR, errno.ELOOP, errno.ENAMETOOLONG)
 _NOT_PERMITTED = (errno.ENOENT, errno.EACCES, errno.EPERM, errno.EROFS)
-_FULL = (errno.ENOSPC, errno.EDQUOT)
+_FULL = (errno.ENOSPC, errno.EDQUOT, errno.EFBIG)
 
 
-def _unwritable(path: Path, error: OSError) -> HaselabError:
-    """Make the error for a path that cannot be created: bad input if another one can."""
-    why = error.strerror or str(error)
+def not_written(path: Path, error: OSError, what: str = "Cannot write") -> DeviceError:
+    """Make the error for what cannot be written, with what to do about this cause.
+
+    Args:
+        path: of the file or folder.
+        error: of the system.
+        what: failed, as the start of the message.
+    Returns:
+        To be raised.
+    """
     if error.errno in _BAD_PATH:
-        return InputError(
-            f"Cannot create this path ({why}): part of it is a file, a broken link, or too long. "
-            f"Name another one. {path}"
-        )
-    if error.errno in _FULL:
-        return DeviceError(f"Cannot write ({why}). Free disk space. {path}")
-    kind = InputError if error.errno in _NOT_PERMITTED else DeviceError
-    return kind(f"Cannot write ({why}). Choose another folder, or change its permissions. {path}")
+        remedy = "Part of the path is a file, a broken link, or too long: name another one."
+    elif error.errno in _FULL:
+        remedy = "Free disk space, or choose another folder."
+    elif error.errno in _NOT_PERMITTED:
+        remedy = "Choose another folder, or change its permissions."
+    else:
+        remedy = "Check the disk, or choose another folder."
+    return DeviceError(f"{what} ({error.strerror or error}). {remedy} {path}")
+
+
+def _not_created(path: Path, error: OSError) -> HaselabError:
+    """Make the error for a path that cannot be created: bad input if another one can."""
+    found = not_written(path, error)
+    return InputError(str(found)) if error.errno in _BAD_PATH + _NOT_PERMITTED else found
 
 
 def _make_parents(folder: Path) -> list[Path]:
@@ -56,7 +70,7 @@ def _make_parents(folder: Path) -> list[Path]:
         folder.mkdir(parents=True, exist_ok=True)
     except OSError as error:
         _remove_empty(missing)
-        raise _unwritable(folder, error) from None
+        raise _not_created(folder, error) from None
     return missing
 
 
@@ -147,7 +161,7 @@ def create_exclusively(path: Path, content: bytes = b"") -> None:
     try:
         path.parent.mkdir(parents=True, exist_ok=True)
     except OSError as error:
-        raise _unwritable(path, error) from None
+        raise _not_created(path, error) from None
     if path.exists() and not (path.is_file() or path.is_dir()):
         return
     try:
@@ -161,7 +175,7 @@ def create_exclusively(path: Path, content: bytes = b"") -> None:
             f"the existing result aside. {path}"
         ) from None
     except OSError as error:
-        raise _unwritable(path, error) from None
+        raise _not_created(path, error) from None
 
 
 def _create_whole(path: Path, content: bytes) -> None:

@@ -11,8 +11,8 @@ from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
-from haselab.base import DeviceError, to_plain
-from haselab.store.claim import create_exclusively
+from haselab.base import to_plain
+from haselab.store.claim import create_exclusively, not_written
 from haselab.store.text_file import parse_json, read_text
 
 __all__ = [
@@ -72,9 +72,7 @@ def write_bytes(path: Path, content: bytes) -> None:
         with drafted(path) as draft:
             draft.write_bytes(content)
     except OSError as error:
-        raise DeviceError(
-            f"Cannot write ({error.strerror}). Free disk space, or choose another folder. {path}"
-        ) from None
+        raise not_written(path, error) from None
 
 
 def write_text(path: Path, text: str) -> None:

@@ -166,6 +166,23 @@ def test_times_of_the_axis_are_not_rounded(
         assert [float(text.removesuffix(" s")) for text in found] == [4 * seconds, 5 * seconds]
 
 
+def test_values_of_the_axis_have_no_rounded_or_negative_zeros(
+    browser: Browser, shared_panel: RunningPanel
+) -> None:
+    """Rounding errors of a drive of 0 V filled the plot, with the labels 0, 0 and -0."""
+    with opened(browser, shared_panel.address) as page:
+        labels, small, large = page.evaluate(
+            """async () => {
+                const { heights, numbers } = await import("/static/charts.js");
+                return [numbers(null, [-0.0005, -1e-19, 0.0005], 0, 0, 0.0005),
+                        heights(0.001)(null, -1e-8, 1e-8), heights(0.001)(null, -5, 5)];
+            }"""
+        )
+        assert labels == ["-0.0005", "0.0000", "0.0005"]
+        assert small[0] <= -0.0005 and small[1] >= 0.0005
+        assert large[0] <= -5.0 and large[1] >= 5.0
+
+
 def test_the_terminal_says_at_the_end_that_0_v_was_commanded(capfd: pytest.CaptureFixture) -> None:
     panel = started()
     ended(panel)

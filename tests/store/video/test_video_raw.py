@@ -69,7 +69,7 @@ def test_no_frames_leave_no_files_and_a_bad_path_is_reported(tmp_path):
     RawVideoWriter(tmp_path / "a.mkv", 100.0).close()
     assert list(tmp_path.iterdir()) == []
     (tmp_path / "file").write_text("")
-    with pytest.raises(DeviceError, match=r"frames cannot be written .*a\.raw$"):
+    with pytest.raises(DeviceError, match=r"The video cannot be written .*a\.raw$"):
         RawVideoWriter(tmp_path / "file" / "a.mkv", 100.0)
 
 

@@ -130,7 +130,7 @@ def _twin_actuator(runs: Path) -> Path:
         try:
             write_text(path, reference_actuator())
         except DeviceError as error:
-            raise DeviceError(f"{error} Or name another folder with --runs.") from None
+            raise DeviceError(f"--runs: {error}") from None
     return path
 
 

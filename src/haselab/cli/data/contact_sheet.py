@@ -8,7 +8,7 @@ import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
-from haselab.base import DeviceError
+from haselab.store.claim import not_written
 from haselab.store.video.grey_range import grey_range
 from haselab.tracking import FrameTracks
 from haselab.tracking.options import Floats, Frame
@@ -80,10 +80,7 @@ def _save(figure: Figure, path: Path) -> None:
         path.parent.mkdir(parents=True, exist_ok=True)
         figure.savefig(path, dpi=120)
     except OSError as error:
-        raise DeviceError(
-            f"The picture cannot be written ({error.strerror or error}). Free disk space or choose "
-            f"another place. {path}"
-        ) from None
+        raise not_written(path, error, "The picture cannot be written") from None
 
 
 def draw_paths(path: Path, image: Frame, x_px: Floats, y_px: Floats) -> None:

@@ -12,7 +12,8 @@ import av.error
 import numpy as np
 from numpy.typing import NDArray
 
-from haselab.base import DeviceError, InputError
+from haselab.base import InputError
+from haselab.store.claim import not_written
 from haselab.store.video.grey_range import grey_range
 from haselab.tracking import FrameTracks
 from haselab.tracking.options import Floats, Frame
@@ -81,10 +82,7 @@ class _Video:
             self._path.parent.mkdir(parents=True, exist_ok=True)
             self._container = av.open(str(self._path), "w")
         except OSError as error:
-            raise DeviceError(
-                f"The overlay cannot be written ({error.strerror or error}). Free disk space or "
-                f"choose another place. {self._path}"
-            ) from None
+            raise not_written(self._path, error, "The overlay cannot be written") from None
         codec = "libx264" if "libx264" in av.codecs_available else "mpeg4"
         stream = self._container.add_stream(codec, rate=Fraction(_PLAY_HZ))
         assert isinstance(stream, av.VideoStream)

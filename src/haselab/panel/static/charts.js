@@ -9,12 +9,13 @@ export const resolved = (name) => { // light-dark() is resolved by the browser, 
 };
 
 const HEIGHT = 130;
+// least: lowest height of the axis, in its unit, so that rounding errors do not fill a plot.
 const PLOTS = [
-  { title: "Voltage", unit: "kV", of: "monitors", lines: [{ name: "voltage", channel: 0, scale: 1e-3 }] },
-  { title: "Strain", unit: "%", of: "signals", lines: [{ name: "sensed", channel: 3, scale: 100 }, { name: "desired", channel: 1, scale: 100 }] },
-  { title: "Capacitance", unit: "pF", of: "signals", lines: [{ name: "capacitance", channel: 2, scale: 1e12 }] },
-  { title: "Current", unit: "mA", of: "monitors", lines: [{ name: "current", channel: 1, scale: 1e3 }] },
-  { title: "Drive", unit: "V", of: "signals", lines: [{ name: "drive", channel: 0, scale: 1 }, { name: "monitor minus drive", channel: 4, scale: 1 }] },
+  { title: "Voltage", unit: "kV", least: 0.01, of: "monitors", lines: [{ name: "voltage", channel: 0, scale: 1e-3 }] },
+  { title: "Strain", unit: "%", least: 0.01, of: "signals", lines: [{ name: "sensed", channel: 3, scale: 100 }, { name: "desired", channel: 1, scale: 100 }] },
+  { title: "Capacitance", unit: "pF", least: 0.1, of: "signals", lines: [{ name: "capacitance", channel: 2, scale: 1e12 }] },
+  { title: "Current", unit: "mA", least: 0.001, of: "monitors", lines: [{ name: "current", channel: 1, scale: 1e3 }] },
+  { title: "Drive", unit: "V", least: 0.001, of: "signals", lines: [{ name: "drive", channel: 0, scale: 1 }, { name: "monitor minus drive", channel: 4, scale: 1 }] },
 ];
 
 const digits = (v) => Number(v.toPrecision(4));
@@ -25,6 +26,12 @@ const range = (low, high, unit) => {
 
 // Ticks of the time axis: as many decimals as their distance needs, such as one for 2.5 s.
 const decimals = (step) => [0, 1, 2, 3, 4, 5].find((n) => Math.abs(step * 10 ** n - Math.round(step * 10 ** n)) < 1e-6) ?? 6;
+export const numbers = (u, ticks, axis, space, step) => ticks.map((v) => v.toFixed(decimals(step)).replace(/^-(0[.0]*)$/, "$1"));
+export const heights = (least) => (u, low, high) => {
+  if (low === null || high === null) return [null, null];
+  const more = Math.max(least - (high - low), 0) / 2;
+  return uPlot.rangeNum(low - more, high + more, 0.1, true);
+};
 export const seconds = (u, ticks, axis, space, step) => ticks.map((v) => `${v.toFixed(decimals(step))} s`);
 
 export class Charts {
@@ -61,8 +68,8 @@ export class Charts {
     const axis = { stroke: text, grid: { stroke: line, width: 1 }, ticks: { stroke: line } };
     const plot = new uPlot({
       width: Math.max(card.clientWidth - 24, 200), height: HEIGHT, series, bands, legend: { show: false },
-      scales: { x: { time: false } },
-      axes: [{ ...axis, size: 32, values: seconds }, { ...axis, size: 70, space: 20, label: about.unit, labelSize: 20 }],
+      scales: { x: { time: false }, y: { range: heights(about.least) } },
+      axes: [{ ...axis, size: 32, values: seconds }, { ...axis, size: 70, space: 20, label: about.unit, labelSize: 20, values: numbers }],
       cursor: { sync: { key: "haselab" }, drag: { x: true, y: false, setScale: false } },
       hooks: {
         draw: [(u) => this.mark(u, text)],

@@ -18,7 +18,7 @@ from pathlib import Path
 from types import TracebackType
 from typing import Self
 
-from haselab.base import DeviceError
+from haselab.store.claim import not_written
 from haselab.store.session.lock import CAN_TELL, hold, is_held
 
 __all__ = ["EXPIRES_S", "Claims"]
@@ -50,10 +50,7 @@ class Claims:
             self._file.write(self.writer.encode())
             self._file.flush()
         except OSError as error:
-            raise DeviceError(
-                f"Cannot write ({error.strerror}). Free disk space, or change the permissions. "
-                f"{self._programs}"
-            ) from None
+            raise not_written(self._own, error) from None
         try:
             hold(self._file.fileno())
             self._has_locks = CAN_TELL
@@ -113,9 +110,7 @@ class Claims:
                 continue
             except OSError as error:
                 path.unlink(missing_ok=True)
-                raise DeviceError(
-                    f"Cannot write ({error.strerror}). Free disk space. {path}"
-                ) from None
+                raise not_written(path, error) from None
             return True
         self._held.discard(block)
         return False

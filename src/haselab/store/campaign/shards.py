@@ -22,7 +22,8 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
-from haselab.base import DeviceError, InputError, Json
+from haselab.base import InputError, Json
+from haselab.store.claim import not_written
 from haselab.store.folder import drafted
 from haselab.store.session.lock import hold
 
@@ -149,10 +150,7 @@ class Shards:
                 os.fsync(file.fileno())
             _synchronise(self._folder)
         except OSError as error:
-            raise DeviceError(
-                f"Cannot write ({error.strerror or error}). Free disk space, or restore the "
-                f"folder. {self._folder}"
-            ) from None
+            raise not_written(path, error) from None
 
     def states(self) -> dict[str, CaseState]:
         """All finished cases by their hashes.

@@ -12,6 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from haselab.base import DeviceError, InputError
+from haselab.store.claim import not_written
 from haselab.store.video.writer import VideoWriter, frame_hash
 
 __all__ = ["RawVideoWriter", "transcode", "waiting_videos"]
@@ -20,10 +21,7 @@ _BATCH = 16  # frames
 
 
 def _failed(error: OSError, path: Path) -> DeviceError:
-    return DeviceError(
-        f"The frames cannot be written ({error.strerror or error}). Free disk space or choose "
-        f"another folder. {path}"
-    )
+    return not_written(path, error, "The video cannot be written")
 
 
 class RawVideoWriter:

@@ -14,6 +14,7 @@ from numpy.typing import NDArray
 from PIL import Image
 
 from haselab.base import DeviceError
+from haselab.store.claim import not_written
 
 __all__ = ["VideoWriter", "frame_hash", "write_png"]
 
@@ -46,10 +47,7 @@ def write_png(path: Path, image: NDArray[np.uint8]) -> None:
         path.parent.mkdir(parents=True, exist_ok=True)
         Image.fromarray(image).save(path)
     except OSError as error:
-        raise DeviceError(
-            f"The picture cannot be written ({error.strerror or error}). Free disk space or choose "
-            f"another folder. {path}"
-        ) from None
+        raise not_written(path, error, "The picture cannot be written") from None
 
 
 class VideoWriter:
@@ -84,10 +82,7 @@ class VideoWriter:
         self._stream.options = {**options}
 
     def _failed(self, error: OSError) -> DeviceError:
-        return DeviceError(
-            f"The video cannot be written ({error.strerror or error}). Free disk space or choose "
-            f"another folder. {self._path}"
-        )
+        return not_written(self._path, error, "The video cannot be written")
 
     def append(self, images: NDArray[np.uint8], time_s: NDArray[np.float64]) -> None:
         """Add frames `(F, H, W)` with the middle of their exposures `(F,)`.

@@ -24,7 +24,7 @@ def test_a_runner_that_starts_in_motion_still_measures_the_strain() -> None:
 
 
 def test_a_length_that_is_none_is_refused() -> None:
-    with pytest.raises(InputError, match=r"zero_length_m is -0\.05; it must be above 0 m"):
+    with pytest.raises(InputError, match=r"zero_length_m is -0\.05; it must be a number above 0 m"):
         hl.Runner(hl.twin(), zero_length_m=-0.05)
 
 

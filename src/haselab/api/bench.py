@@ -19,6 +19,7 @@ from haselab.base import (
     Progress,
     ResultError,
     SilentProgress,
+    check_length,
     checked,
     real_array,
     shown,
@@ -250,10 +251,7 @@ class Runner:
         frame_rate_hz: float = 50.0,
         progress: Progress | None = None,
     ) -> None:
-        if zero_length_m is not None and not 0.0 < zero_length_m < math.inf:
-            raise InputError(
-                f"zero_length_m is {zero_length_m:g}; it must be above 0 m and finite."
-            )
+        check_length("zero_length_m", zero_length_m)
         self._memory = _Memory()
         self._camera = CameraRecorder(rig.camera, self._memory, _NO_FOLDER, "none")
         self._runner = runtime.Runner(

@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING, Any, TypeAlias
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from haselab.base import InputError, checked, is_real, real_array, shown
+from haselab.base import InputError, check_length, checked, real_array, shown
 from haselab.identify.record import Record
 from haselab.pipelines.examples.data_sets import find_data_set, write_data_set
 from haselab.pipelines.sensing.series import derived_series
@@ -103,12 +103,7 @@ class Session:
 
 def _with_zero_length(zero_length_m: float | None) -> Derived:
     """What is computed from an experiment, with a length that was checked."""
-    if zero_length_m is not None and not (
-        is_real(zero_length_m) and 0.0 < zero_length_m < math.inf
-    ):
-        raise InputError(
-            f"zero_length_m is {shown(zero_length_m)}; it must be a number above 0 m and finite."
-        )
+    check_length("zero_length_m", zero_length_m)
     return partial(derived_series, zero_length_m=zero_length_m)
 
 

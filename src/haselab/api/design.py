@@ -2,12 +2,11 @@
 
 from __future__ import annotations
 
-import math
 from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
 
-from haselab.base import InputError, check_fields, checked, generator
+from haselab.base import InputError, check_fields, check_length, checked, generator
 from haselab.control import (
     Design,
     DesignSpec,
@@ -111,10 +110,7 @@ class Actuator:
 
     def __post_init__(self) -> None:
         check_fields(self)
-        if self.zero_length_m is not None and not 0.0 < self.zero_length_m < math.inf:
-            raise InputError(
-                f"zero_length_m is {self.zero_length_m:g}; it must be above 0 m and finite."
-            )
+        check_length("zero_length_m", self.zero_length_m)
 
     @classmethod
     @checked

@@ -2,6 +2,7 @@
 
 from haselab.base.arguments import (
     check_fields,
+    check_length,
     checked,
     generator,
     is_real,
@@ -40,6 +41,7 @@ __all__ = [
     "SafetyError",
     "SilentProgress",
     "check_fields",
+    "check_length",
     "checked",
     "described",
     "generator",

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import functools
 import inspect
+import math
 import sys
 from collections.abc import Callable, Mapping, Sequence
 from numbers import Integral, Real
@@ -15,7 +16,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from haselab.base.errors import InputError
 
-__all__ = ["check_fields", "checked", "generator", "is_real", "real_array", "shown"]
+__all__ = ["check_fields", "check_length", "checked", "generator", "is_real", "real_array", "shown"]
 
 Given = ParamSpec("Given")
 Answer = TypeVar("Answer")
@@ -227,6 +228,19 @@ def is_real(value: object) -> TypeGuard[float]:
     if not isinstance(value, Real) or isinstance(value, (bool, np.bool_)):
         return False
     return not isinstance(value, int) or abs(value) <= sys.float_info.max
+
+
+def check_length(name: str, value: object) -> None:
+    """Refuse what is neither None nor a length.
+
+    Args:
+        name: of the argument.
+        value: in m.
+    Raises:
+        InputError: it is not a finite number above 0.
+    """
+    if value is not None and not (is_real(value) and 0.0 < value < math.inf):
+        raise InputError(f"{name} is {shown(value)}; it must be a number above 0 m and finite.")
 
 
 def _described(kind: Any) -> str:

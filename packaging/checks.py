@@ -23,7 +23,7 @@ _INSTALL_S = 60.0
 _MODULES = ("_camera", "_core", "_identify", "_loops", "_models", "_motion", "_sense", "_track",
             "_twin")  # fmt: skip
 _SOURCES = ("core", "firmware/app", "firmware/board", "firmware/protocol", "native/twin",
-            "native/motion", "rigs", "examples/kinds")  # fmt: skip
+            "native/motion", "rigs", "examples")  # fmt: skip
 _COMMANDS = (
     "doctor",
     "init my-actuator --out actuator.toml",
@@ -64,7 +64,7 @@ def check_contents(wheel: Path) -> str:
     wanted = {
         name.removeprefix("src/") if name.startswith("src/") else f"haselab/sources/{name}"
         for name in listed
-        if name.startswith("src/") or name.endswith((".c", ".h", ".toml", ".ld"))
+        if name.startswith(("src/", "examples/")) or name.endswith((".c", ".h", ".toml", ".ld"))
     }
     missing = sorted(wanted - names)
     missing += [name for name in _MODULES if not any(f"haselab/{name}." in each for each in names)]

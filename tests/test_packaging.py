@@ -6,6 +6,7 @@ import shutil
 import subprocess
 import sys
 import sysconfig
+import tarfile
 import zipfile
 from collections.abc import Callable
 from importlib import metadata
@@ -100,6 +101,17 @@ def test_a_wheel_contains_everything_that_runs(
         str(tmp_path / "site" / "haselab" / "sources"), "atmega2560", "stm32g071", "bench.toml",
         "twin-hz.toml", "twin-rad.toml", "reference-study.toml",
     ]  # fmt: skip
+
+
+def test_the_source_distribution_contains_all_sources(tmp_path: Path, installed: Installed) -> None:
+    """The wheels are built from it; it lacked the tests of the example packages."""
+    code = "import sys; from scikit_build_core.build import build_sdist; build_sdist(sys.argv[1])"
+    run([sys.executable, "-c", code, tmp_path], ROOT)
+    with tarfile.open(next(tmp_path.glob("*.tar.gz"))) as opened:
+        found = {name.partition("/")[2] for name in opened.getnames()}
+    folders = "src", "core", "native", "firmware", "rigs", "examples"
+    listed = run([installed("git", "git"), "ls-files", *folders], ROOT).split("\n")
+    assert sorted(name for name in listed if name not in found) == []
 
 
 def test_a_missing_file_is_found(wheel: Path, checks: ModuleType, tmp_path: Path) -> None:

@@ -23,6 +23,7 @@ from haselab.rig.twin.twin_bench import make_twin
 from haselab.safety.gate import Gate
 from haselab.testing.conformance import (
     BenchConformance,
+    DaqConformance,
     GeneratorConformance,
     InstrumentConformance,
     SupplyConformance,
@@ -117,13 +118,19 @@ class TestBackEnds(BenchConformance):
 
 
 @pytest.fixture(scope="module")
-def served_file(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Path]:
-    """The rig file of a served twin, whose instruments the registry opens one by one."""
+def served_twin() -> Iterator[ServedTwin]:
+    """A served twin, whose instruments the registry opens one by one."""
     pytest.importorskip("pty", reason="serial ports of the served twin are POSIX's")
     with ServedTwin(twin_of_reading("hz"), 1, pace=0.0) as served:
-        path = tmp_path_factory.mktemp("served") / "rig.toml"
-        path.write_text(served.rig_file())
-        yield path
+        yield served
+
+
+@pytest.fixture(scope="module")
+def served_file(served_twin: ServedTwin, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Its rig file."""
+    path = tmp_path_factory.mktemp("served") / "rig.toml"
+    path.write_text(served_twin.rig_file())
+    return path
 
 
 class TestServedSupply(SupplyConformance):
@@ -144,12 +151,14 @@ class TestServedGenerator(GeneratorConformance):
         return served_file
 
 
-class TestServedBoard(InstrumentConformance):
-    section = "daq"
-
+class TestServedBoard(DaqConformance):
     @pytest.fixture
     def rig_file(self, served_file: Path) -> Path:
         return served_file
+
+    @pytest.fixture
+    def output_v(self, served_twin: ServedTwin) -> Callable[[], float]:
+        return lambda: float(served_twin.hub.output_v)
 
 
 class TestServedCamera(InstrumentConformance):

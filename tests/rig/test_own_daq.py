@@ -4,10 +4,11 @@ from __future__ import annotations
 
 import shutil
 import sys
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import pytest
 
 from haselab.cli.main import main
@@ -18,7 +19,8 @@ from haselab.rig.rig_file import load_rig, opened_rig
 from haselab.safety.gate import Gate
 from haselab.safety.guardian.make_safe import make_safe, revoke_and_make_safe
 from haselab.safety.interlock import Interlock
-from haselab.testing.conformance import BenchConformance, InstrumentConformance
+from haselab.store.video.writer import write_png
+from haselab.testing.conformance import BenchConformance, DaqConformance
 
 RIG = """
 kind = "bench"
@@ -76,8 +78,12 @@ class TestOwnBench(BenchConformance):
     """As with the drivers of this package."""
 
 
-class TestOwnDaq(InstrumentConformance):
-    section = "daq"
+class TestOwnDaq(DaqConformance):
+    """The output is also read at the twin, without the driver."""
+
+    @pytest.fixture
+    def output_v(self, module: Any) -> Callable[[], float]:
+        return lambda: float(module.BENCHES[-1].output_v)
 
 
 def test_its_instruments_identify_themselves(file: BenchConfig) -> None:
@@ -120,6 +126,10 @@ def test_a_driver_that_fails_under_voltage_is_named_after_0_v(
     error: Exception,
 ) -> None:
     monkeypatch.setattr(module, "FAULTS", [error])
+    (tmp_path / "images").mkdir()
+    write_png(tmp_path / "images" / "1.png", np.zeros((32, 32), np.uint8))
+    camera = f'[camera]\nkind = "folder"\npath = "{tmp_path / "images"}"\nrepeat = true\n'
+    rig_file.write_text(RIG + camera)
     monkeypatch.setenv("PYTHONPATH", str(Path(module.__file__).parent))  # of the guardians
     study = tmp_path / "study.toml"
     study.write_text(

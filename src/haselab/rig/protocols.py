@@ -121,7 +121,7 @@ class RigDescription:
 
     @property
     def switch_in_block(self) -> int:
-        """Sample of every block at which the output changes."""
+        """Last sample of every block that shows the old output; the output changes after it."""
         return self.switch_sample % self.block_samples
 
     @property

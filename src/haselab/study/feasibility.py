@@ -30,6 +30,7 @@ __all__ = [
     "check_study_on_rig",
     "rated_rig",
     "rating_of_twin",
+    "require_camera",
     "study_drives",
     "study_masses_kg",
 ]
@@ -171,7 +172,10 @@ def rated_rig(file: RigFile, study: Study, path: Path) -> tuple[RigDescription, 
         file: from `load_rig`.
         study: what will be played.
         path: of the rig file.
+    Raises:
+        InputError: the study needs a camera, and the rig has none.
     """
+    require_camera(file, study, path)
     if isinstance(file, TwinFile):
         config = file.configuration(path)
         return describe(config), rating_of_twin(config, study)
@@ -179,6 +183,30 @@ def rated_rig(file: RigFile, study: Study, path: Path) -> tuple[RigDescription, 
     if section is None or not isinstance(file, BenchConfig):
         return None
     return file.describe(), Rating(**section.model_dump())
+
+
+def require_camera(file: RigFile, study: Study, path: Path) -> None:
+    """Refuse experiments that would end without frames, after they have applied voltage.
+
+    Args:
+        file: from `load_rig`.
+        study: what will be played.
+        path: of the rig file.
+    Raises:
+        InputError: the study needs a camera, and the rig has none.
+    """
+    if not isinstance(file, BenchConfig) or file.camera is not None:
+        return
+    filmed = [
+        f"[{each.table}]"
+        for each in experiments_of(study)
+        if each.recordings() and hasattr(each.settings, "frame_rate_hz")
+    ]
+    if filmed:
+        raise InputError(
+            f"The study cannot be played: {', '.join(filmed)} measures the length with a camera, "
+            f"but the rig file has no section [camera]. Add one. {path}"
+        )
 
 
 def check_study_on_rig(file: RigFile, study: Study | StepStudy, path: Path) -> Feasibility | None:
@@ -190,6 +218,8 @@ def check_study_on_rig(file: RigFile, study: Study | StepStudy, path: Path) -> F
         path: of the rig file.
     Returns:
         The checks; None if the rating of the rig is unknown.
+    Raises:
+        InputError: see `rated_rig`.
     """
     if isinstance(study, StepStudy):  # for a chip, whose limits are in its firmware
         return None

@@ -45,6 +45,29 @@ def test_the_reference_study_is_feasible_on_the_twin(reading: str) -> None:
     assert len(printed.checks) >= 5 and all(check.ok for check in printed.checks)
 
 
+@pytest.mark.parametrize("command", ["run", "plan feasibility"])
+def test_a_bench_without_a_camera_is_refused_before_it_is_armed(
+    command: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """A triangle was played on it to the end, and then failed for lack of frames."""
+    rig, study = tmp_path / "bench.toml", tmp_path / "study.toml"
+    rig.write_text(
+        'kind = "bench"\n[daq]\n[amplifier]\nname = "any"\n[generator]\n'
+        'address = "TCPIP::127.0.0.1::5025::SOCKET"\n[specimen]\nshell_width_m = 0.03\n'
+        "shell_thickness_m = 0.002\nmass_kg = 0.25\n"
+    )
+    study.write_text(
+        'name = "maps"\n[triangle]\nlow_v = 0.0\nhigh_v = 1.0\nfrequency_hz = 0.25\n'
+        "cycles = 3\nskipped_cycles = 1\nframe_rate_hz = 50.0\n"
+    )
+    out = ["--yes", "--out", str(tmp_path / "out")] if command == "run" else []
+    with pytest.raises(SystemExit) as stop:
+        main([*command.split(), str(study), "--rig", str(rig), *out])
+    assert stop.value.code == 2
+    said = capsys.readouterr().err
+    assert "[triangle] measures the length with a camera" in said and "[camera]. Add one" in said
+
+
 def test_the_predicted_field_is_the_field_that_breaks_the_twin() -> None:
     # A ramp to the highest output with the twin's own weight; its breakdown set just around.
     study = builtin_study()
@@ -293,9 +316,9 @@ def test_a_fault_names_the_section_of_a_limit_that_two_sections_have(
         if section == "safety":
             safety_of(file, {"current_limit_a": 0.0}, path)
         else:
-            bench = BenchConfig.model_construct(kind="bench", rating={"current_limit_a": 0.0} | {
-                "slew_v_per_s": 1.0, "bandwidth_hz": 1.0, "capacitance_f": 1.0,
-                "thickness_m": 1.0, "breakdown_v_per_m": 1.0,
+            bench = BenchConfig.model_construct(kind="bench", camera=object(), rating={
+                "current_limit_a": 0.0, "slew_v_per_s": 1.0, "bandwidth_hz": 1.0,
+                "capacitance_f": 1.0, "thickness_m": 1.0, "breakdown_v_per_m": 1.0,
             })  # fmt: skip
             check_study_on_rig(bench, builtin_study(quick=True), path)
 

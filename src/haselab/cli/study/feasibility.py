@@ -20,6 +20,7 @@ from haselab.cli.study.run import load_study_with_actuator
 from haselab.rig.rig_file import load_rig
 from haselab.safety.feasibility import Feasibility
 from haselab.store.folder import write_json
+from haselab.study.experiments.steps import unplayed_trials
 from haselab.study.feasibility import check_study, rated_rig
 
 __all__ = ["command"]
@@ -65,6 +66,8 @@ def command(
             load_study_with_actuator(study, actuator, quick=True)
         except InputError as error:
             raise InputError(f"With the changes of [quick]: {error}") from None
+    if note := unplayed_trials(plan):
+        click.echo(f"haselab: {note}", err=True)
     file = load_rig(rig)
     rated = rated_rig(file, plan, rig)
     if rated is None:

@@ -32,7 +32,8 @@ from haselab.store.actuator_file import ACTUATOR
 from haselab.store.folder import write_text
 from haselab.store.text_file import read_text
 from haselab.study.definition import Study, load_step_study, load_study, quick_note
-from haselab.study.feasibility import check_settings
+from haselab.study.experiments.steps import unplayed_trials
+from haselab.study.feasibility import check_settings, require_camera
 from haselab.study.known import with_actuator_tables
 
 __all__ = ["command", "load_study_with_actuator", "rig_file"]
@@ -118,6 +119,8 @@ def command(
         return
     plan = load_study_with_actuator(study, actuator, quick=quick)
     _note_quick(study, quick)
+    if note := unplayed_trials(plan):
+        click.echo(f"haselab: {note}", err=True)
     if actuator is not None:
         warn_doubts(actuator)
     if isinstance(file, TwinFile):
@@ -128,6 +131,7 @@ def command(
             _start_from(actuator, out)
             execute(plan, bench, config, file.seed, out, keep_video, as_json, known=known)
         return
+    require_camera(file, plan, rig)
     with (
         gated_rig(file, rig) as opened,
         armed_rig(_prepared(opened, plan, actuator), file, rig, plan, out, operator) as bench,

@@ -85,7 +85,7 @@ class DaqConfig(InstrumentConfig):
 
     @property
     def switch_in_block(self) -> int:
-        """Sample of a block at which the output changes."""
+        """Last sample of a block that shows the old output; the output changes after it."""
         return round(self.output_delay_s * self.rate_hz)
 
     @property

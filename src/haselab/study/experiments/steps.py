@@ -31,7 +31,7 @@ from haselab.study.player import UPDATE_HZ, Player
 from haselab.study.quantity import Quantity
 from haselab.study.tables import Steps, StepTimes
 
-__all__ = ["StepTest", "closed_names", "open_names", "step_reference"]
+__all__ = ["StepTest", "closed_names", "open_names", "step_reference", "unplayed_trials"]
 
 _CLOSED = {
     "pi": "PI step",
@@ -66,6 +66,26 @@ def closed_names(study: Study, group: str) -> list[str]:
         "saturating": steps.saturating_trials,
     }[group]
     return [f"{group}-{k + 1}" for k in range(trials)]
+
+
+def unplayed_trials(study: Study) -> str:
+    """Say which closed-loop trials will not be played; empty if there are none.
+
+    Args:
+        study: with or without `[steps]`.
+    """
+    missing = [f"[{table}]" for table in ("chirp", "control") if not study.has(table)]
+    if not study.has("steps") or not missing:
+        return ""
+    counts = {f"steps.{group}_trials": len(closed_names(study, group)) for group in ("pi", "pid")}
+    asked = [f"{key} = {count}" for key, count in counts.items() if count]
+    if not asked:
+        return ""
+    return (
+        f"Not played: {' and '.join(asked)}. This controller is designed from a chirp, and the "
+        f"study has no {' and no '.join(missing)}. To play the controller of the actuator file or "
+        "one named in [control], set steps.custom_trials."
+    )
 
 
 def step_reference(steps: StepTimes) -> np.ndarray[tuple[int], np.dtype[np.float64]]:

@@ -20,7 +20,7 @@ from haselab.store.optional import library
 
 library("pytest", "test")  # in one clear line, before the modules that import it
 
-from haselab.testing.conformance.bench import BenchConformance  # noqa: E402
+from haselab.testing.conformance.bench import BenchConformance, DaqConformance  # noqa: E402
 from haselab.testing.conformance.instruments import (  # noqa: E402
     BlockTimer,
     CameraConformance,
@@ -33,6 +33,7 @@ __all__ = [
     "BenchConformance",
     "BlockTimer",
     "CameraConformance",
+    "DaqConformance",
     "GeneratorConformance",
     "InstrumentConformance",
     "SupplyConformance",

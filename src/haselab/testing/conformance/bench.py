@@ -2,19 +2,30 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from haselab.base import LimitError
+from haselab.base import DeviceError, LimitError
+from haselab.rig.instruments.instrument import DaqInstrument
 from haselab.rig.protocols import Rig
 from haselab.rig.rig_file import load_rig, opened_rig
 from haselab.safety.gate import Gate
+from haselab.testing.conformance.instruments import WITHIN_S, InstrumentConformance
 
-__all__ = ["CARRIER_HZ", "CARRIER_V", "BenchConformance", "carrier_v", "drive_v", "pass_queue"]
+__all__ = [
+    "CARRIER_HZ",
+    "CARRIER_V",
+    "BenchConformance",
+    "DaqConformance",
+    "carrier_v",
+    "drive_v",
+    "pass_queue",
+]
 
 CARRIER_HZ, CARRIER_V = 2000.0, 0.02
 _SETTLED_S = 0.5e-3  # after an output has changed
@@ -90,14 +101,18 @@ class BenchConformance:
     def test_a_new_output_takes_effect_at_the_switch_sample_of_the_next_block(
         self, rig: Rig
     ) -> None:
-        """`RigDescription.switch_sample`, to the sample."""
+        """`RigDescription.switch_in_block` is the last sample that shows the old output."""
         d = rig.description
         rig.acquisition.read()
         rig.source.write(1.0)
         pass_queue(rig)
         block = drive_v(rig)[0]
         settled = d.switch_in_block + round(_SETTLED_S * d.rate_hz)
-        assert np.abs(block[: d.switch_in_block + 1]).max() < _SHARE
+        early = np.abs(block[: d.switch_in_block + 1]) >= _SHARE
+        assert not early.any(), (
+            f"sample {early.argmax()} of the block shows the new output, but sample "
+            f"{d.switch_in_block} (daq.output_delay_s) must be the last one with the old output"
+        )
         np.testing.assert_allclose(block[settled:], 1.0, rtol=_SHARE)
 
     def test_of_several_outputs_within_a_block_the_last_one_counts(self, rig: Rig) -> None:
@@ -192,3 +207,52 @@ class BenchConformance:
         with pytest.raises(LimitError, match=r"."):
             rig.generator.sine(frequency_hz, amplitude_v)
         assert carrier_v(rig) == pytest.approx(CARRIER_V, rel=0.1)
+
+
+class DaqConformance(InstrumentConformance):
+    """Tests of the connection to a data acquisition device, and of its shutdown.
+
+    Blocks and outputs are tested by `BenchConformance`, so derive a class from that, too.
+    """
+
+    section = "daq"
+
+    @pytest.fixture
+    def output_v(self) -> Callable[[], float] | None:
+        """Override it: the output in V, read at the emulator or with a meter, not by the driver."""
+        return None
+
+    def test_the_rig_file_gives_the_key_of_the_device(
+        self, instrument: DaqInstrument[Any], config: Any
+    ) -> None:
+        """`haselab rig safe` revokes the permission by it while the device does not respond."""
+        connection = instrument.connect(config)
+        try:
+            key = connection.key
+        finally:
+            connection.close()
+        found = instrument.key_of(config)
+        assert found in (None, key), f"key_of gives {found!r}, but the device has the key {key!r}"
+
+    def test_a_shutdown_from_outside_ends_at_0_v(
+        self,
+        instrument: DaqInstrument[Any],
+        config: Any,
+        rig_file: Path,
+        output_v: Callable[[], float] | None,
+    ) -> None:
+        """The run that uses it reads 0 V afterwards, or an error says that the device is lost."""
+        with opened_rig(load_rig(rig_file), rig_file, gate := Gate()) as rig:
+            gate.permit(gate.interlock.revision)
+            rig.source.write(1.0)
+            rig.acquisition.read()
+            pass_queue(rig)
+            np.testing.assert_allclose(drive_v(rig)[0, -1], 1.0, rtol=_SHARE)
+            instrument.shut_down(config, WITHIN_S)
+            if output_v is not None:
+                assert abs(output_v()) < _SHARE
+            try:
+                assert np.abs(drive_v(rig, 2)[-1]).max() < _SHARE
+            except DeviceError as error:
+                if output_v is None:
+                    pytest.skip(f"without a fixture output_v, 0 V cannot be seen: {error}")

@@ -26,6 +26,7 @@ from haselab.rig.instruments.registry import instrument_of
 from haselab.rig.rig_file import load_rig
 
 __all__ = [
+    "WITHIN_S",
     "BlockTimer",
     "CameraConformance",
     "GeneratorConformance",
@@ -33,7 +34,7 @@ __all__ = [
     "SupplyConformance",
 ]
 
-_WITHIN_S = 3.0  # as long as the guardians retry a refused connection
+WITHIN_S = 3.0  # as long as the guardians retry a refused connection
 _REACH_S = 10.0  # longest time for a supply to reach its set point, or to discharge
 
 
@@ -149,7 +150,7 @@ class _OffConformance(InstrumentConformance):
     ) -> None:
         """The guardians and `haselab rig safe` do this while the program is still connected."""
         self.energise(device)
-        instrument.shut_down(config, _WITHIN_S)
+        instrument.shut_down(config, WITHIN_S)
         assert device.is_off()
 
     @pytest.fixture
@@ -170,7 +171,7 @@ class _OffConformance(InstrumentConformance):
         self.energise(device)
         stuck_on()
         with pytest.raises(DeviceError, match=r"."):
-            instrument.shut_down(config, _WITHIN_S)
+            instrument.shut_down(config, WITHIN_S)
 
     def test_identifying_leaves_an_output_that_is_off(
         self, device: Any, instrument: OutputInstrument[Any], config: Any

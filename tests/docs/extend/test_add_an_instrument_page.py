@@ -69,6 +69,12 @@ def lab(make_shell) -> Iterator[Lab]:
         yield Lab(shell, emulator, twin)
 
 
+def test_the_rig_file_of_the_page_is_that_of_the_example() -> None:
+    shown = re.search(r'```python\n(RIG = """.*?""")\n```', TEXT, re.DOTALL)
+    assert shown is not None
+    assert shown[1] in (PACKAGE / "tests" / "test_mysupply.py").read_text(encoding="utf-8")
+
+
 def test_the_emulator_runs_as_a_program() -> None:
     script = PACKAGE / "tests" / "emulator.py"
     assert f"python haselab-mysupply/tests/{script.name}`; it prints its `host` and `port`" in TEXT

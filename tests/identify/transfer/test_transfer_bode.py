@@ -57,6 +57,18 @@ def test_model_and_measurement_lie_on_the_closed_form() -> None:
     assert np.all(np.abs(phase.curves[0].y - at) <= 180.0 + 1e-9)
 
 
+def test_the_axis_ends_above_what_the_record_shows() -> None:
+    """A record at 5 kHz of a chirp to 20 Hz was drawn to 2.5 kHz, with its points in a corner."""
+    rate_hz, time_s = 5000.0, np.arange(100_000) / 5000.0
+    rng = np.random.default_rng(5)
+    u = np.sin(2.0 * np.pi * time_s * (0.5 + 0.5 * 19.5 * time_s / time_s[-1]))
+    u = u + 0.01 * rng.normal(size=u.size)
+    y = PLANT.simulate(u, rate_hz, time_s) + NOISE * rng.normal(size=u.size)
+    magnitude, phase = _bode(fit_transfer(Record(u, rate_hz, y, time_s)))
+    for panel in (magnitude, phase):
+        assert all(15.0 < curve.x.max() < 45.0 for curve in panel.curves)
+
+
 def test_without_a_frequency_response_the_model_is_drawn_alone() -> None:
     magnitude, phase = _bode(fit_transfer(_played(3, late_s=0.003)))
     (label,) = (curve.label for curve in magnitude.curves)

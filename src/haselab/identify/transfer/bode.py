@@ -19,6 +19,8 @@ __all__ = ["bode_panels"]
 Floats = NDArray[np.float64]
 Complexes = NDArray[np.complex128]
 _POINTS, _DRAWS, _SEED = 300, 200, 1
+_DRIVEN = 0.99  # share of the input's power
+_ABOVE_POLES = 10.0
 _LONG = 20000  # samples of the records, from which segments are averaged, which takes less time
 
 
@@ -41,7 +43,7 @@ def bode_panels(
         The panel of the magnitude and that of the phase.
     """
     duration_s = max(record.u.size / record.input_rate_hz for record in records)
-    highest_hz = 0.5 * max(record.input_rate_hz for record in records)
+    highest_hz = max(_highest_hz(model, records), 2.0 / duration_s)
     frequency_hz = np.geomspace(1.0 / duration_s, highest_hz, _POINTS)
     response = model.frequency_response(2.0 * np.pi * frequency_hz)
     size_std, turn_std = _deviations(posterior, frequency_hz, response)
@@ -49,7 +51,8 @@ def bode_panels(
     size = gain_label("Magnitude", *(names or ("", "")))
     sizes, phases, measured = [], [], _measured(records)
     if measured is not None:
-        hz, lines = measured
+        shown = measured[0] <= highest_hz
+        hz, lines = measured[0][shown], measured[1][shown]
         near = np.interp(hz, frequency_hz, phase)
         turns = np.degrees(near + np.angle(lines * np.exp(-1j * near)))
         sizes.append(Curve(hz, np.abs(lines), "measured", "points"))
@@ -63,6 +66,22 @@ def bode_panels(
         Panel("Frequency (Hz)", size, sizes, log_x=True, log_y=True),
         Panel("Frequency (Hz)", "Phase (°)", phases, log_x=True),
     )
+
+
+def _highest_hz(model: RationalModel, records: Sequence[Record]) -> float:
+    """Upper end of the axis: where the input has power, and well above the fastest pole.
+
+    Half the rate of a record may be far above both, and would leave the points in a corner.
+    """
+    driven_hz = 0.0
+    for record in records:
+        power = np.abs(np.fft.rfft((record.u - record.u.mean()) * np.hanning(record.u.size))) ** 2
+        sums = np.cumsum(power)
+        at = int(np.searchsorted(sums, _DRIVEN * sums[-1]))
+        driven_hz = max(driven_hz, at * record.input_rate_hz / record.u.size)
+    fastest_hz = float(np.abs(model.poles).max(initial=0.0)) / (2.0 * np.pi)
+    nyquist_hz = 0.5 * max(record.input_rate_hz for record in records)
+    return min(nyquist_hz, max(2.0 * driven_hz, _ABOVE_POLES * fastest_hz))
 
 
 def _deviations(

@@ -16,6 +16,10 @@ _NOT_WHITE = (
     "valid only if its structure is right. Try {}--choose nonlinear (such as the square of a "
     "voltage), or --choose all."
 )
+_NOISY_INPUT = (
+    "If none of them helps, the cause may be noise of the measured input, which the model "
+    "passes on to the output; identify from the commanded drive to exclude this."
+)
 _CREEP = "--slow-modes 1 (creep), "
 _EARLY = 0.1  # share of the output's range
 _LEAST_EARLY = 20  # outputs before the input first changes
@@ -55,7 +59,9 @@ def remarks_of(
     if structure.slow_modes and structure.initial_state and early > _EARLY:
         notes.append(_EARLY_CHANGE.format(100.0 * early))
     if best.whiteness_p < 0.05:
-        notes.append(_NOT_WHITE.format("" if structure.slow_modes else _CREEP))
+        measured = any(record.hold == "band-limited" for record in best.records)
+        note = _NOT_WHITE.format("" if structure.slow_modes else _CREEP)
+        notes.append(f"{note} {_NOISY_INPUT}" if measured else note)
     return notes
 
 

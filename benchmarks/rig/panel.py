@@ -133,9 +133,13 @@ def cpu_s(process: int) -> float:
 
 
 def memory_mb(process: int) -> float:
-    """Resident memory of a process, in MB."""
-    pages = int(Path(f"/proc/{process}/statm").read_text().split()[1])
-    return pages * os.sysconf("SC_PAGE_SIZE") / 1e6
+    """Resident memory of a process in MB, without files and without the columns that it shares.
+
+    The space of the columns is reserved at the start. It counts as resident once it has been read,
+    so that it would grow for the 20 minutes after which it is overwritten.
+    """
+    resident, shared = map(int, Path(f"/proc/{process}/statm").read_text().split()[1:3])
+    return (resident - shared) * os.sysconf("SC_PAGE_SIZE") / 1e6
 
 
 def child(process: int, name: str) -> int:

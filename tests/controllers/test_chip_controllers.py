@@ -23,7 +23,7 @@ from haselab.scoreboard.plant import FastPlant
 DEVICE, LOOP = find_device("hz"), CLASSES["chip-1khz"]
 PARAMETERS = {
     "chip-force": {"kp": 2.8, "ki": 467.0, "kd": 0.575, "filter_s": 0.0088, "reserve": 0.15},
-    "chip-observer": {"bandwidth_rad_s": 149.9, "load_n": 0.132, "shake_m_s2": 0.01,
+    "chip-observer": {"bandwidth_rad_s": 57.71, "load_n": 0.5676, "shake_m_s2": 0.04,
                       "reserve": 0.15},
 }  # fmt: skip
 KINDS = sorted(PARAMETERS)
@@ -162,3 +162,22 @@ def test_the_design_has_a_result_that_fits_the_integers(kind: str, known: KnownA
     assert design is not None
     values = design(setting_of(known, 0.0))
     CONTROLLERS.find(kind).choose(values).make().start(setting_of(known, 0.0))
+    if kind == "chip-observer":
+        assert values["shake_m_s2"] == 0.04
+
+
+def test_an_observer_of_large_accelerations_moves_less_with_a_load(known: KnownActuator) -> None:
+    """10 % more weight: at most 0.5 % strain, and less than 0.1 % after 150 ms."""
+    setting = setting_of(known, known.static_drive_v(0.0))
+    motion, point = motion_record(setting, 0.15), sampled_point(setting, 0.0)
+    added_n, moved = 0.1 * known.mass_kg * GRAVITY_M_S2, []
+    for values in ((57.71, 0.5676, 0.04), (40.98, 0.3167, 0.01)):  # the best of both designs
+        loop = linear_chip_loop(motion, setting, point, values)
+        state, strains = np.zeros(loop.load.size), []
+        for _ in range(400):
+            state = loop.a @ state + added_n * loop.load
+            strains.append(abs(float(loop.length @ state)) / known.zero_length_m)
+        moved.append(np.array(strains))
+    large, small = moved
+    assert large.max() < 0.005 < 0.0065 < small.max()
+    assert large[150:].max() < 1e-3

@@ -35,7 +35,7 @@ BUDGET = 12_000  # of the 16,000 cycles of a millisecond
 # designed for the twin with haselab.scoreboard: gains as they are used, not the search for them
 PARAMETERS = {
     "chip-force": {"kp": 2.8, "ki": 467.0, "kd": 0.575, "filter_s": 0.0088, "reserve": 0.15},
-    "chip-observer": {"bandwidth_rad_s": 149.9, "load_n": 0.132, "shake_m_s2": 0.01,
+    "chip-observer": {"bandwidth_rad_s": 57.71, "load_n": 0.5676, "shake_m_s2": 0.04,
                       "reserve": 0.15},
     "network": {},
 }  # fmt: skip

@@ -53,6 +53,7 @@ from haselab.study.simulated.agreement import (
     check_stable,
     predicted_loop,
 )
+from haselab.study.simulated.scatter import scatter_of
 from haselab.study.simulated.truth import twin_of
 
 __all__ = ["build", "command", "flash", "simulate"]
@@ -311,6 +312,7 @@ def simulate(
         "highest_code": chip.highest_code,
         "loops": rows,
         **_compared(agreement),
+        **({} if case is None else _scattered(runs[-1], case)),
     }
     section = to_plain(section_of(runs, rows))
     if plot is not None:
@@ -429,6 +431,17 @@ def _compared(found: Agreement | None) -> dict[str, Any]:
         "comparison": sentence,
         "status": "ok" if found.agrees else "differs from the prediction",
     }
+
+
+def _scattered(chip: LoopRun, case: StepCase) -> dict[str, Any]:
+    """How much the strain of the chip scatters at rest, and why."""
+    found = scatter_of(chip, case)
+    answer = {
+        "scatter": found.simulated,
+        "scatter_predicted": found.predicted,
+        "scatter_without_rate_limit": found.linear,
+    }
+    return {**answer, "scatter_cause": found.cause} if found.cause else answer
 
 
 def _draw(section: Mapping[str, Any], path: Path) -> None:

@@ -17,6 +17,7 @@ from numpy.typing import NDArray
 
 from haselab.actuators import ADDED_INERTIA, DRIFTS
 from haselab.actuators.threads import in_threads
+from haselab.base import HaselabError
 from haselab.base.estimate import Z95
 from haselab.identify.physical.information import covariance_of, vague_information
 from haselab.identify.physical.misfit import Misfit
@@ -28,7 +29,7 @@ __all__ = ["extend_intervals"]
 
 Floats = NDArray[np.float64]
 _LESS, _MORE = 0.9, 1.15  # growth over that of a quadratic misfit that counts as the same
-_STEPS = 6  # of the search for the other parameters
+_STEPS = 4  # of the search for the other parameters
 _ROUNDS = 3  # of one end
 _FARTHER = 2.0  # times, in one round
 
@@ -95,9 +96,13 @@ class _Valley:
             if _LESS * wanted <= growth <= _MORE * wanted:
                 return float(beside.values[k])
         for _ in range(_ROUNDS):
-            grown = self._grown(k, reach, along)
-            if grown is None or grown >= _LESS * wanted:
+            again = self._fitted(k, reach, along)
+            if again is None:
                 break
+            grown = self._cost(*again) - self.least
+            if grown >= _LESS * wanted:
+                break
+            along = again[0].distance(self.unknowns) / reach  # the next one starts on the curve
             reach *= min(_FARTHER, math.sqrt(wanted / max(grown, 1e-3 * wanted)))
         return float(self._at(k, reach, along).values[k])
 
@@ -107,15 +112,15 @@ class _Valley:
         values = np.where(np.isnan(moved.values), moved.limits[1], moved.values)
         return replace(moved, values=values).within_limits()
 
-    def _grown(self, k: int, distance: float, along: Floats) -> float | None:
-        """Growth of the misfit at a distance of a parameter, with the others fitted again."""
+    def _fitted(self, k: int, distance: float, along: Floats) -> tuple[Unknowns, Floats] | None:
+        """The others fitted again at a distance of one, with their residuals."""
         beside, name = self._at(k, distance, along), self.unknowns.names[k]
-        again = refine(
-            self.misfit, beside.without((name,)), steps=_STEPS, begun=self.begun.without((name,))
-        )
-        if again is None:
+        try:
+            start = beside.without((name,))
+        except HaselabError:  # parameters that the law cannot have together
             return None
-        return self._cost(beside.at(again.unknowns), again.residuals) - self.least
+        again = refine(self.misfit, start, steps=_STEPS, begun=self.begun.without((name,)))
+        return None if again is None else (beside.at(again.unknowns), again.residuals)
 
     def _cost(self, unknowns: Unknowns, residuals: Floats) -> float:
         away = unknowns.distance(self.begun)

@@ -28,6 +28,7 @@ from haselab.identify.physical.unknowns import Unknowns
 __all__ = ["extend_intervals"]
 
 Floats = NDArray[np.float64]
+_WIDE = 0.03  # standard deviation over the width of the start, below which a misfit is quadratic
 _LESS, _MORE = 0.9, 1.15  # growth over that of a quadratic misfit that counts as the same
 _STEPS = 4  # of the search for the other parameters
 _ROUNDS = 3  # of one end
@@ -54,10 +55,12 @@ def extend_intervals(
         return fit
     unknowns = found.unknowns
     std = np.sqrt(np.diag(fit.covariance)) / np.abs(unknowns.slopes)
+    widths = unknowns.widths
     chosen = [
         (k, sign)
         for k, name in enumerate(unknowns.names)
-        if name in unknowns.law_names
+        if std[k] > _WIDE * widths[k]
+        and name in unknowns.law_names
         and name not in {ADDED_INERTIA, *DRIFTS, *fit.not_identifiable}
         for sign in (-1.0, 1.0)
     ]

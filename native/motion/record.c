@@ -14,6 +14,10 @@
 #define SLOW_M_S 1e-4
 #define LONG_PHASE 0.6
 #define LONG_STEP_S 0.05
+/* Beyond the table, forces are constant, and an actuator that has collapsed gets faster and faster.
+ * A hysteresis would have to be followed in ever shorter steps, so there it stops: at that share of
+ * the table's range outside. */
+#define STOP_SHARE 0.01
 
 /* Weights of Hermite's cubic at a share of a step of dt: lengths and speeds of both ends. */
 typedef struct {
@@ -54,6 +58,22 @@ HS_CLONES static void blend_rows(const ends *e, int32_t n, const double *restric
     int32_t j;
     for (j = 0; j < n; ++j) {
         out[j] = from_m * kept[j] + from_m_s * kept[n + j] + to_m * rows[j] + to_m_s * rows[n + j];
+    }
+}
+
+static void stop_outside(const motion_law *law, const motion_parameters *p, motion_state *s,
+                         motion_tangent *t)
+{
+    const double range_m = (double)(law->lengths - 1) / law->per_step_m;
+    const double low_m = law->low_m - STOP_SHARE * range_m;
+    const double stop_m = fmax(low_m, fmin(s->length_m, law->low_m + (1.0 + STOP_SHARE) * range_m));
+    if (!(p->hysteresis_n > 0.0) || isnan(s->length_m) || s->length_m == stop_m) {
+        return;
+    }
+    s->length_m = stop_m;
+    s->speed_m_s = 0.0;
+    if (t != NULL) {
+        memset(t->rows, 0, 2 * (size_t)t->columns * sizeof(double));
     }
 }
 
@@ -175,6 +195,7 @@ void motion_play(const motion_law *law, const motion_parameters *p, motion_state
                 memcpy(output->kept, tangent->rows, 2 * n * sizeof(double));
             }
             motion_step(law, &moving, s, tangent, &in, now.dt);
+            stop_outside(law, p, s, tangent);
             next = sample(&now, tangent, record, output, next, until_s);
             if (record->sensed[k]) {
                 integrate(law, &now, tangent, scale, &in, output, k, mean_by);

@@ -8,7 +8,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from scipy.optimize import minimize_scalar
 
-from haselab.actuators import CurlingHasel, PeanoHasel, equilibrium_m
+from haselab.actuators import CurlingHasel, PeanoHasel, curling_hasel, equilibrium_m
 from haselab.base import LimitError
 
 
@@ -45,3 +45,12 @@ def test_it_rests_where_the_energy_of_strip_cells_and_load_is_smallest(load_n, v
 def test_a_curl_beyond_its_cells_is_refused():
     with pytest.raises(LimitError, match=r"^actuator.curl_rad = 1.6 is not below 1.48 rad, where"):
         CurlingHasel(curl_rad=1.6, lever_m=0.015)
+
+
+def test_the_curl_at_many_lengths_needs_no_more_steps_than_at_one(monkeypatch):
+    law, steps = CurlingHasel(), []
+    slope = curling_hasel._slope
+    monkeypatch.setattr(curling_hasel, "_slope", lambda angle: steps.append(1) or slope(angle))
+    limits = law.length_limits_m
+    law.curl_rad_at(np.linspace(limits.low, limits.high, 1024))
+    assert len(steps) <= 8

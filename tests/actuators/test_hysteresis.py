@@ -1,6 +1,7 @@
 """Rate-independent hysteresis: energy, loops, the general solver, derivatives, linear model."""
 
 import dataclasses
+import time
 
 import numpy as np
 import pytest
@@ -219,3 +220,19 @@ def test_a_width_of_zero_is_refused():
         PlanarHasel(hysteresis_width=0.0)
     with pytest.raises(LimitError, match=r"^The hysteresis has a force of 0 N and a width of 0"):
         dataclasses.replace(DeaStack().losses, hysteresis_width=0.0)
+
+
+def test_a_collapsed_actuator_stops_and_takes_no_longer_than_one_that_moves():
+    # beyond its table the force is constant: it got faster and faster, in ever shorter steps
+    law = DeaStack(hysteresis_n=0.06, hysteresis_width=0.02)
+    volt = np.where(np.arange(6000) < 200, 0.0, 15e3)
+    sampled = SampledLaw(law, 16e3, ["actuator.shear_modulus_pa"])
+    start, start_by = sampled.at_rest(0.0, 0.0, LOAD_N)
+    times_s = np.linspace(0.0, 60.0, 600)
+    begun_s = time.process_time()
+    found = sampled.respond(drive_of(volt, 0.01), times_s, start, start_by=start_by)
+    assert time.process_time() - begun_s < 1.0
+    range_m = sampled.table.high_m - sampled.table.low_m
+    assert found.length_m[0] > sampled.table.low_m
+    assert sampled.table.low_m - 0.02 * range_m <= found.length_m[-1] <= sampled.table.low_m
+    assert np.isfinite(found.length_by).all()

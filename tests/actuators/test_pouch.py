@@ -113,3 +113,11 @@ def test_the_arcs_have_the_films_length_and_hold_the_liquid(share, place):
 def test_an_electrode_that_fills_the_pouch_is_refused():
     with pytest.raises(LimitError, match=r"^The electrode of 0.019 m covers more than 90% of the"):
         PeanoHasel(electrode_length_m=0.019)
+
+
+def test_all_of_the_arcs_at_once_are_those_of_one_after_the_other():
+    pouch, angle = Pouch(0.02, 0.01), np.linspace(0.25, 1.5, 50)
+    found = pouch.arcs(angle, np.sin(angle), np.cos(angle))
+    parts = pouch.zipped_m(angle), pouch.stroke_m(angle), pouch.zipped_per_rad(angle)
+    for one, other in zip(found, parts, strict=True):
+        np.testing.assert_allclose(one, other, rtol=1e-12)

@@ -10,12 +10,15 @@ from scipy.integrate import solve_ivp
 from haselab import _motion
 from haselab.actuators import (
     ActuatorState,
+    CurlingHasel,
     DeaStack,
     Drive,
+    PeanoHasel,
     PlanarHasel,
     SampledLaw,
     equilibrium_m,
     rates,
+    response,
     with_parameters,
 )
 from haselab.actuators.threads import in_threads
@@ -239,3 +242,29 @@ def test_the_index_after_the_last_adds_a_branch():
         _ = with_parameters(PlanarHasel(), {"viscosity.share[3]": 0.1}).losses
     with pytest.raises(InputError, match=r"viscosity.share\[4\] does not exist: .* has 3 values"):
         with_parameters(PlanarHasel(), {"viscosity.share[4]": 0.1})
+
+
+@pytest.mark.parametrize("law", [PeanoHasel(), CurlingHasel()], ids=lambda law: law.kind)
+def test_derivatives_of_a_pouch_are_differences_of_solved_laws(law):
+    # a similar law starts from the solution of this one, with a single step of Newton
+    name, rel = "actuator.film_stiffness_n_per_m", 1e-3
+    table = SampledLaw(law, 1e4, [name])
+    ends = [
+        SampledLaw(with_parameters(law, {name: 25e3 * (1.0 + s * rel)}), 1e4).table
+        for s in (-1.0, 1.0)
+    ]
+    by = (ends[1].elastic_n - ends[0].elastic_n) / (2.0 * rel * 25e3)
+    np.testing.assert_allclose(table._elastic[0], by, atol=1e-4 * np.abs(by).max())
+    by = (ends[1].pull_n_v2 - ends[0].pull_n_v2) / (2.0 * rel * 25e3)
+    np.testing.assert_allclose(table._pull[0], by, atol=1e-3 * np.abs(by).max())
+
+
+def test_the_law_that_was_just_simulated_is_not_tabulated_again(monkeypatch):
+    law, tabulated = PeanoHasel(damping_n_s_per_m=6.25), []
+    table_of = response.law_table
+    monkeypatch.setattr(
+        response, "law_table", lambda *what: tabulated.append(what) or table_of(*what)
+    )
+    SampledLaw(law, 1e4)
+    SampledLaw(law, 1e4, ["actuator.permittivity"])
+    assert len(tabulated) == 1

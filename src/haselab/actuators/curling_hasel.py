@@ -21,6 +21,7 @@ __all__ = ["CurlingHasel"]
 Floats = NDArray[np.float64]
 _STRAIGHTEST, _MOST_CURLED = 0.28, 1.8  # rad, of the whole strip
 _NEWTON = 60
+_CLOSE = 1e-12  # last step of Newton's iteration, after which the error is that of rounding
 
 
 @dataclass(frozen=True)
@@ -210,7 +211,7 @@ class CurlingHasel(ActuatorLaw):
         for _ in range(_NEWTON):
             step = (np.sin(angle) / angle - share) / _slope(angle)
             angle = angle - step
-            if (np.abs(step) <= 1e-15 * angle).all():
+            if (np.abs(step) <= _CLOSE * angle).all():
                 break
         return np.asarray(angle)
 

@@ -228,6 +228,9 @@ class ActuatorLaw(abc.ABC):
     def same_statics(self, other: ActuatorLaw) -> bool:
         """Whether another law of this kind differs at most in fields that `Losses` has too.
 
+        Forces and capacitances are then taken as the same. Override it in a law in which they
+        depend on such a field.
+
         Args:
             other: any law.
         """

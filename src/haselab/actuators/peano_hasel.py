@@ -254,20 +254,24 @@ class PeanoHasel(ActuatorLaw):
         known = near.solution if near else None
         if not isinstance(known, np.ndarray) or known.shape != (every_v.size, length.size):
             known = None
-        found = self._state(length, every_v[:, None], known)
+        rows = 1 + count
+        found = self._state(length, every_v[:rows, None], None if known is None else known[:rows])
         at_rest_n = found.tension_n[0]
-        pull_n_v2 = (at_rest_n - found.tension_n[1 : 1 + count]) / acting_v[:, None] ** 2
+        pull_n_v2 = (at_rest_n - found.tension_n[1:]) / acting_v[:, None] ** 2
+        y = found.y
         if small.any():  # see `electric_force_n`
-            slopes = found.tension_per_pull[1 + count :].reshape(-1, _NODES.size, length.size)
+            within = self._state(
+                length, every_v[rows:, None], None if known is None else known[rows:], slopes=True
+            )
+            slopes = within.tension_per_pull.reshape(-1, _NODES.size, length.size)
             mean = 0.5 * np.einsum("vnl,n->vl", slopes, _WEIGHTS)
             pull_n_v2[small] = -0.5 * self.zipped_f_per_m * mean
-        zipped_m = np.where(
-            voltages_v[:, None] < 1.0, found.zipped_m[:1], found.zipped_m[1 : 1 + count]
-        )
+            y = np.concatenate([y, within.y])
+        zipped_m = np.where(voltages_v[:, None] < 1.0, found.zipped_m[:1], found.zipped_m[1:])
         return LawValues(
             self, lengths_m, at_rest_n + self.restoring_n_per_m * (length - self.pouch.rest_m),
             self.pouches * (self._unzipped_f + self.zipped_f_per_m * zipped_m),
-            pull_n_v2, found.y,
+            pull_n_v2, y,
         )  # fmt: skip
 
     def elastic_energy_j(self, length_m: ArrayLike) -> Floats:
@@ -362,17 +366,25 @@ class PeanoHasel(ActuatorLaw):
         zipping_j = self._pull_n(voltage) * state.zipped_m
         return np.asarray(film_j + resisted_j - rounded_j - zipping_j)
 
-    def _state(self, length: Floats, voltage_v: ArrayLike, near: Floats | None = None) -> _State:
+    def _state(
+        self,
+        length: Floats,
+        voltage_v: ArrayLike,
+        near: Floats | None = None,
+        *,
+        slopes: bool = False,
+    ) -> _State:
         r"""Solve the balance of zipping, $T\,ds/dz = \tfrac12\kappa V^2 + \theta/z - U'$.
 
         In $y = \ln(ds/dz)$ the tension is explicit, and so is the length, which falls with y.
-        The solution of a similar law is near enough for two steps of Newton.
+        The solution of a similar law is near enough for one step of Newton, and for two if
+        `tension_per_pull` is wanted, which does not follow that step.
         """
         length, pull_n = np.broadcast_arrays(length, self._pull_n(voltage_v))
         wanted_m, pulls_n = length.ravel(), pull_n.ravel()
         with np.errstate(all="ignore"):  # outside the bracket some terms are infinite
             y = self._solved(wanted_m, pulls_n) if near is None else near.ravel()
-            if near is not None:
+            if near is not None and slopes:
                 y = y + self._left(y, self._balance(y, pulls_n), wanted_m)
             found = self._balance(y, pulls_n)
             left = 0.0 if near is None else self._left(y, found, wanted_m)
@@ -453,9 +465,9 @@ class PeanoHasel(ActuatorLaw):
         steep = np.exp(y)
         cosine = 1.0 / (1.0 + steep)
         sine = np.sqrt(steep * (steep + 2.0)) * cosine
-        angle = np.arctan2(sine, cosine)
-        zipped_m = pouch.zipped_m(angle)
-        zipped_by = pouch.zipped_per_rad(angle) * cosine**2 * steep / sine
+        arcs = pouch.arcs(np.arctan2(sine, cosine), sine, cosine)
+        zipped_m = arcs.zipped_m
+        zipped_by = arcs.zipped_per_rad * cosine**2 * steep / sine
         left_m = self.electrode_length_m - zipped_m
         resisted_n = self._pull_n(self.half_zipped_v) * zipped_m / left_m
         rounded_n = self._rounding_j / zipped_m
@@ -465,11 +477,12 @@ class PeanoHasel(ActuatorLaw):
         )
         tension_n = needed_n / steep
         share = tension_n / (stiffness * rounding_m)
-        stretch_m = rounding_m * (share + np.log(-np.expm1(-share)))
-        compliance = -1.0 / (stiffness * np.expm1(-share))
+        slack = -np.expm1(-share)
+        stretch_m = rounding_m * (share + np.log(slack))
+        compliance = 1.0 / (stiffness * slack)
         return _Balance(
             steep, zipped_m, zipped_by, needed_n, needed_by,
-            pouch.rest_m - pouch.stroke_m(angle), stretch_m,
+            pouch.rest_m - arcs.stroke_m, stretch_m,
             compliance * (needed_by / steep - tension_n) - steep * zipped_by,
             (needed_n > 0.0) & (zipped_m > 0.0) & (left_m > 0.0),
         )  # fmt: skip

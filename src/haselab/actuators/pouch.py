@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 from dataclasses import dataclass
 from functools import cached_property
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -12,11 +13,19 @@ from numpy.typing import ArrayLike, NDArray
 from haselab.base import LimitError
 from haselab.base.root import root
 
-__all__ = ["Pouch"]
+__all__ = ["Arcs", "Pouch"]
 
 Floats = NDArray[np.float64]
 _LARGEST_SHARE = 0.9  # of the electrode in the pouch; the blocked force diverges towards 1
 _NEWTON = 60
+
+
+class Arcs(NamedTuple):
+    """A pouch at some half angles of its arcs."""
+
+    zipped_m: Floats
+    stroke_m: Floats
+    zipped_per_rad: Floats
 
 
 @dataclass(frozen=True)
@@ -79,6 +88,22 @@ class Pouch:
     def longest_stroke_m(self) -> float:
         """Stroke at which the electrodes are used up."""
         return float(self.stroke_m(0.5 * math.pi))
+
+    def arcs(self, angle_rad: Floats, sine: Floats, cosine: Floats) -> Arcs:
+        """Zipped length, stroke and slope at once, where sine and cosine are known already.
+
+        Args:
+            angle_rad: half angle of the arcs. Shape `(...)`.
+            sine: of it. Shape `(...)`.
+            cosine: of it. Shape `(...)`.
+        Returns:
+            The same as `zipped_m`, `stroke_m` and `zipped_per_rad`.
+        """
+        bulge = angle_rad - sine * cosine
+        left_m = angle_rad * np.sqrt(2.0 * self.fill_m2 / bulge)
+        zipped_m = self.length_m - left_m
+        stroke_m = self.rest_m - left_m * sine / angle_rad - zipped_m
+        return Arcs(zipped_m, stroke_m, left_m * (sine**2 / bulge - 1.0 / angle_rad))
 
     def zipped_m(self, angle_rad: ArrayLike) -> Floats:
         """Zipped length.

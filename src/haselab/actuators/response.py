@@ -16,6 +16,7 @@ import dataclasses
 import os
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
+from functools import lru_cache
 from types import MappingProxyType
 
 import numpy as np
@@ -25,7 +26,7 @@ from haselab import _motion
 from haselab.actuators.law import ActuatorLaw
 from haselab.actuators.losses import DRIFTS, drift_pairs
 from haselab.actuators.operating_point import equilibrium_m
-from haselab.actuators.table import at_all_voltages, law_table, solved_voltages
+from haselab.actuators.table import LawTable, at_all_voltages, law_table, solved_voltages
 from haselab.actuators.threads import in_threads
 from haselab.base import InputError, LimitError
 
@@ -51,6 +52,7 @@ _COLUMNS_EACH = 24  # for fewer columns, another thread costs more: it repeats t
 _PHASE = 0.1  # of the fastest motion in a step, rad
 _SHORTEST_STEP_S = 1e-6
 _STEP = 1e-4  # of a parameter, for the derivatives of the law's table
+_REMEMBERED = 4  # laws: a search wants the derivatives of the one that it has just simulated
 
 
 def motion_parameters(law: ActuatorLaw) -> NDArray[np.void]:
@@ -307,8 +309,27 @@ def _difference(
     return net[1] - net[0]
 
 
+def _same_softening(one: ActuatorLaw, other: ActuatorLaw) -> bool:
+    return all(
+        getattr(one.losses, name) == getattr(other.losses, name)
+        for name in ("softening_share", "softening_stretch", "softening_transition")
+    )
+
+
 def _losses_of(parameters: NDArray[np.void]) -> Floats:
     return np.array([parameters[name].reshape(-1)[k] for name, k, _ in _LOSSES])
+
+
+@lru_cache(maxsize=_REMEMBERED)
+def _remembered_table(law: ActuatorLaw, highest_v: float) -> LawTable:
+    return law_table(law, highest_v)
+
+
+@lru_cache(maxsize=_REMEMBERED)
+def _remembered_rest_m(
+    law: ActuatorLaw, voltage_v: float, load_n: float, longest_m: float | None
+) -> float:
+    return equilibrium_m(law, voltage_v, load_n, longest_m=longest_m)
 
 
 class SampledLaw:
@@ -335,7 +356,7 @@ class SampledLaw:
         drifts: Mapping[str, float] = MappingProxyType({}),
     ) -> None:
         self.law, self.by = law, tuple(by)
-        self.table = law_table(law, highest_v)
+        self.table = _remembered_table(law, highest_v)
         self.parameters = motion_parameters(law)
         self.parameters["inertia_kg"] += added_inertia_kg
         for field, pair in drift_pairs(drifts).items():
@@ -408,7 +429,7 @@ class SampledLaw:
             LimitError: There is no equilibrium.
         """
         acting_v = float(np.hypot(voltage_v, np.sqrt(ripple_v2)))
-        length_m = equilibrium_m(self.law, acting_v, load_n, longest_m=longest_m or None)
+        length_m = _remembered_rest_m(self.law, acting_v, load_n, longest_m or None)
         longest = max(length_m, longest_m)
         branches = len(self.law.losses.branch_share)
         state = np.zeros(1, _motion.STATE)
@@ -424,10 +445,14 @@ class SampledLaw:
         rows = np.zeros((_motion.ROWS, len(self.by)))
         for column, name in enumerate(self.by):
             low, high, width = _beside(self.law, name)
+            if low.same_statics(high) and _same_softening(low, high):
+                continue
             force = _difference([low, high], [length_m] * 2, acting_v, longest_m) / width
             moved = -force * 2.0 * step_m / slope
             rows[_LENGTH_ROW, column] = moved
             rows[_LONGEST_ROW, column] = moved if longest == length_m else 0.0
+            if not branches:
+                continue
             electric = [float(part.electric_force_n(length_m, acting_v)) for part in (low, high)]
             rows[_RELAXED_ROW : _RELAXED_ROW + branches, column] = (
                 electric[1] - electric[0]

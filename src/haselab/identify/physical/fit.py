@@ -29,6 +29,7 @@ from haselab.identify.physical.plausible import (
     judge_estimates,
     motion_before_drive,
 )
+from haselab.identify.physical.profile import extend_intervals
 from haselab.identify.physical.record import MotionRecord
 from haselab.identify.physical.residuals import (
     channel_of,
@@ -223,11 +224,11 @@ def _fit(
         start = start.with_law(found.unknowns.present_law(), found.unknowns.drifts)
     on_stage("search with the noise of the records")
     misfit, found = _weighed(
-        Misfit(records, known=known, strict=True), start.at(found.unknowns), found
+        Misfit(records, known=known, strict=True), start.at(found.unknowns), found, start
     )
     anew = _from_start(misfit, start, found)
     if anew is not None and anew is not found:
-        misfit, found = _weighed(misfit, start.at(anew.unknowns), anew)
+        misfit, found = _weighed(misfit, start.at(anew.unknowns), anew, start)
     on_stage("comparison with other causes and further effects")
     scaled = _scale_instead(misfit, lacking, found, rejected) if rejected else None
     if scaled is None:
@@ -237,10 +238,10 @@ def _fit(
         # no wrong scale: on its way, the search has found a better minimum
         nearer = refine(misfit, scaled.found.unknowns, found.evaluations)
         if nearer is not None and rms_of([nearer.residuals]) < rms_of([found.residuals]):
-            misfit, found = _weighed(misfit, nearer.unknowns, nearer)
+            misfit, found = _weighed(misfit, nearer.unknowns, nearer, start)
         scaled = None
     if scaled is not None:
-        misfit, found = _weighed(scaled.misfit, scaled.found.unknowns, scaled.found)
+        misfit, found = _weighed(scaled.misfit, scaled.found.unknowns, scaled.found, start)
     seen = channel_residuals(misfit, found)
     if len(records) > 1 and seen.excess[0] > _APART and _each_alone(misfit, start):
         return ActuatorFit(status=_CONTRADICT, kind=law.kind, evaluations=found.evaluations)
@@ -252,7 +253,9 @@ def _fit(
     others = compare_elastic_laws(misfit, found) if certain else []
     rejected += [rival for rival in others if rival.log_evidence < 0.0]
     preferred = [rival for rival in others if rival.log_evidence > 0.0]
-    return result_of(misfit, _ordered(found), rejected, preferred, scaled, clock=clock)
+    found = _ordered(found)
+    fit = result_of(misfit, found, rejected, preferred, scaled, clock=clock)
+    return extend_intervals(fit, misfit, found, start)
 
 
 def _first_acts(records: Sequence[MotionRecord]) -> str:
@@ -311,7 +314,7 @@ def _with_effects(
         again = _from_start(misfit, better.start.at(start), again, explained=True)
         if again is None or not _explains(misfit, found, again):
             break
-        misfit, found = _weighed(misfit, again.unknowns, again)
+        misfit, found = _weighed(misfit, again.unknowns, again, start)
         rejected.append(Rival(f"without {better.effect}", -better.log_evidence))
     suspect = not channel_residuals(misfit, found).explained or suspect_scale(misfit, found)
     return misfit, found, rejected, find_wrong_scale(misfit, found) if suspect else None
@@ -429,14 +432,24 @@ def _from_start(
     return found
 
 
-def _weighed(misfit: Misfit, start: Unknowns, found: SearchResult) -> tuple[Misfit, SearchResult]:
-    """Estimate the noise and the parameters in turn."""
+def _weighed(
+    misfit: Misfit, start: Unknowns, found: SearchResult, begun: Unknowns
+) -> tuple[Misfit, SearchResult]:
+    """Estimate the noise and the parameters in turn.
+
+    Args:
+        misfit: to minimise.
+        start: first values.
+        found: before.
+        begun: where the user began; values that it lacks begin at `start`.
+    """
+    begun = start.at(begun)
     for _ in range(_ROUNDS):
         factors = _factors(misfit, found)
         same = np.allclose(factors, (misfit.length_factor, misfit.capacitance_factor),
                            rtol=_SAME_NOISE)  # fmt: skip
         misfit = replace(misfit, length_factor=factors[0], capacitance_factor=factors[1])
-        again = refine(misfit, start, found.evaluations)
+        again = refine(misfit, start, found.evaluations, begun=begun)
         if again is None:
             break
         start, found = again.unknowns, again

@@ -95,7 +95,12 @@ def search(misfit: Misfit, start: Unknowns, evaluations: int = 0) -> SearchResul
 
 
 def refine(
-    misfit: Misfit, start: Unknowns, evaluations: int = 0, *, steps: int = _LAST_STEPS
+    misfit: Misfit,
+    start: Unknowns,
+    evaluations: int = 0,
+    *,
+    steps: int = _LAST_STEPS,
+    begun: Unknowns | None = None,
 ) -> SearchResult | None:
     """Minimise the misfit from near its minimum.
 
@@ -104,13 +109,16 @@ def refine(
         start: first values.
         evaluations: of the model, made before.
         steps: at most.
+        begun: values that count as a weak observation, of the same names; None: `start`. A search
+            that goes on must keep those of its beginning. Otherwise, what the records hardly
+            determine moves on with each call.
     Returns:
         The new result; None if no motion exists there.
     """
     first = misfit.linearised(start)
     if first is None:
         return None
-    return _last_stage(misfit, _State(start, *first), start, evaluations + 1, steps)
+    return _last_stage(misfit, _State(start, *first), begun or start, evaluations + 1, steps)
 
 
 def _last_stage(

@@ -34,7 +34,8 @@ extensions = [
 root_doc = "docs/index"
 include_patterns = [
     "docs/**.md", "docs/**.rst", "docs/**.ipynb",
-    "README.md", "CONTRIBUTING.md", "SECURITY.md", "ARCHITECTURE.md", "CHANGELOG.md",
+    "README.md", "CONTRIBUTING.md", "CODE_OF_CONDUCT.md", "SECURITY.md", "ARCHITECTURE.md",
+    "CHANGELOG.md",
     "benchmarks/README.md", "examples/plugins/*/README.md",
 ]  # fmt: skip
 exclude_patterns = [
@@ -46,7 +47,7 @@ html_math_renderer = "mathml"
 
 # ---- Markdown and notebooks -----------------------------------------------------------------
 
-myst_enable_extensions = ["dollarmath", "colon_fence", "deflist"]
+myst_enable_extensions = ["dollarmath", "colon_fence", "deflist", "html_image"]
 myst_heading_anchors = 5
 nb_execution_mode = "cache"
 nb_execution_raise_on_error = True

@@ -26,6 +26,7 @@ extensions = [
     "myst_nb",
     "sphinx.ext.autodoc",
     "sphinx.ext.autosummary",
+    "sphinx.ext.viewcode",
     "api_pages",
     "command_pages",
     "mathml",
@@ -41,7 +42,7 @@ include_patterns = [
 exclude_patterns = [
     ".*", "out", "build", "dist", "src", "tests", "**/.ipynb_checkpoints", "docs/sphinx",
 ]  # fmt: skip
-highlight_language = "none"
+highlight_language = "text"  # not "none", with which the pages of the source have no colours
 nitpicky = True
 html_math_renderer = "mathml"
 

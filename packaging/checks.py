@@ -39,7 +39,7 @@ _COMMANDS = (
     "plan feasibility peano/study.toml --rig peano/rig.toml",
 )
 # What a site consists of: folders of its pages, folders of other files, files beside the folders.
-_PAGE_FOLDERS = ("benchmarks", "docs", "examples")
+_PAGE_FOLDERS = ("_modules", "benchmarks", "docs", "examples")
 _FILE_FOLDERS = ("_downloads", "_images", "_sources", "_static")
 _FILES = ("objects.inv", "searchindex.js")
 _WITHOUT_COMPILER = ("cc", "gcc", "c++", "g++", "clang", "clang++")

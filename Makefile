@@ -47,7 +47,7 @@ help:
 	@echo 'make bench   measure the published figures on a part of the cases: at most 10 minutes'
 	@echo 'make bench-full  measure them on all cases: hours'
 	@echo 'make setup   virtual environment, extensions, and the packages that the tests need'
-	@echo 'make dist    build and check the wheels and the source distribution in dist/'
+	@echo 'make dist    build and check the wheels, the source distribution and the documentation in dist/'
 	@echo 'make clean   delete $(VENV), build and caches; out is kept'
 
 study: $(VENV)/.built

@@ -26,6 +26,7 @@ extensions = [
     "myst_nb",
     "sphinx.ext.autodoc",
     "sphinx.ext.autosummary",
+    "sphinx.ext.viewcode",
     "api_pages",
     "command_pages",
     "mathml",
@@ -34,19 +35,20 @@ extensions = [
 root_doc = "docs/index"
 include_patterns = [
     "docs/**.md", "docs/**.rst", "docs/**.ipynb",
-    "README.md", "CONTRIBUTING.md", "SECURITY.md", "ARCHITECTURE.md", "CHANGELOG.md",
+    "README.md", "CONTRIBUTING.md", "CODE_OF_CONDUCT.md", "SECURITY.md", "ARCHITECTURE.md",
+    "CHANGELOG.md",
     "benchmarks/README.md", "examples/plugins/*/README.md",
 ]  # fmt: skip
 exclude_patterns = [
     ".*", "out", "build", "dist", "src", "tests", "**/.ipynb_checkpoints", "docs/sphinx",
 ]  # fmt: skip
-highlight_language = "none"
+highlight_language = "text"  # not "none", with which the pages of the source have no colours
 nitpicky = True
 html_math_renderer = "mathml"
 
 # ---- Markdown and notebooks -----------------------------------------------------------------
 
-myst_enable_extensions = ["dollarmath", "colon_fence", "deflist"]
+myst_enable_extensions = ["dollarmath", "colon_fence", "deflist", "html_image"]
 myst_heading_anchors = 5
 nb_execution_mode = "cache"
 nb_execution_raise_on_error = True

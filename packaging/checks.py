@@ -4,8 +4,10 @@ from __future__ import annotations
 
 import json
 import os
+import re
 import shutil
 import subprocess
+import tarfile
 import time
 import zipfile
 from pathlib import Path
@@ -13,9 +15,10 @@ from pathlib import Path
 from wheels import ROOT
 
 __all__ = [
-    "CheckError", "check_abi3", "check_citation", "check_contents", "check_digest",
-    "check_emulated", "check_install", "check_loads", "check_metadata", "check_old_processor",
-    "check_platform", "check_sdist", "check_size", "is_abi3",
+    "CheckError", "check_abi3", "check_citation", "check_contents", "check_description",
+    "check_digest", "check_docs", "check_emulated", "check_install", "check_loads",
+    "check_metadata", "check_old_processor", "check_platform", "check_sdist", "check_size",
+    "is_abi3", "version_of",
 ]  # fmt: skip
 
 _LARGEST_MB = 5.0
@@ -35,6 +38,10 @@ _COMMANDS = (
     "example peano-hasel --out peano",
     "plan feasibility peano/study.toml --rig peano/rig.toml",
 )
+# What a site consists of: folders of its pages, folders of other files, files beside the folders.
+_PAGE_FOLDERS = ("_modules", "benchmarks", "docs", "examples")
+_FILE_FOLDERS = ("_downloads", "_images", "_sources", "_static")
+_FILES = ("objects.inv", "searchindex.js")
 _WITHOUT_COMPILER = ("cc", "gcc", "c++", "g++", "clang", "clang++")
 
 
@@ -81,9 +88,14 @@ def check_metadata(python: Path, files: list[Path]) -> str:
     return f"{len(files)} files"
 
 
+def version_of(sdist: Path) -> str:
+    """The version in the name of a source distribution."""
+    return sdist.name.removeprefix("haselab-").removesuffix(".tar.gz")
+
+
 def check_citation(sdist: Path) -> str:
     """CITATION.cff names the version, if it is a release."""
-    version = sdist.name.removeprefix("haselab-").removesuffix(".tar.gz")
+    version = version_of(sdist)
     if "dev" in version:
         return "not a release"
     lines = (ROOT / "CITATION.cff").read_text(encoding="utf-8").splitlines()
@@ -93,6 +105,56 @@ def check_citation(sdist: Path) -> str:
     if cited != version:
         raise CheckError(f"the version in CITATION.cff is {cited}, but the package's is {version}")
     return version
+
+
+def check_description(sdist: Path) -> str:
+    """The description of a release has no relative link or picture; elsewhere it leads nowhere."""
+    if "dev" in version_of(sdist):
+        return "not a release"
+    with tarfile.open(sdist) as opened:
+        metadata = opened.extractfile(f"{sdist.name.removesuffix('.tar.gz')}/PKG-INFO")
+        text = metadata.read().decode("utf-8") if metadata else ""
+    description = re.sub(r"(?ms)^ *```.*?^ *```$|`[^`\n]*`", "", text.partition("\n\n")[2])
+    targets = re.findall(r"\]\(\s*<?([^)\s>]+)", description)
+    targets += re.findall(r"(?m)^ {0,3}\[[^]]+\]:\s*<?([^\s>]+)", description)
+    targets += re.findall(r"(?i)\b(?:href|src)\s*=\s*[\"']?([^\"'\s>]+)", description)
+    relative = [each for each in targets if not re.match(r"#|[a-zA-Z][a-zA-Z0-9+.-]*:", each)]
+    if relative:
+        raise CheckError(f"{len(relative)} relative links or pictures, such as {relative[0]}")
+    return f"{len(targets)} links, none relative"
+
+
+def check_docs(archive: Path) -> str:
+    """The documentation has its search and the start page of each section, and only the site."""
+    top, version = f"{archive.stem}/", archive.stem.removeprefix("haselab-").removesuffix("-docs")
+    with zipfile.ZipFile(archive) as opened:
+        names = [name.removeprefix(top) for name in opened.namelist() if name.startswith(top)]
+        foreign = [name for name in opened.namelist() if not name.startswith(top)]
+        foreign += [name for name in names if not _belongs_to_site(name)]
+        missing = sorted({"index.html", "searchindex.js", *_start_pages()} - set(names))
+        if missing or foreign:
+            found = f"{missing[0]} is missing" if missing else f"{foreign[0]} is not of the site"
+            raise CheckError(f"{len(missing) + len(foreign)} faults, such as: {found}")
+        title = re.search(r"<title>(.*?)</title>", opened.read(f"{top}docs/index.html").decode())
+    if title is None or f"haselab {version}" not in title[1]:
+        raise CheckError(f"the title of docs/index.html does not name haselab {version}")
+    pages = sum(name.endswith(".html") for name in names)
+    return f"{pages} pages, {archive.stat().st_size / 1e6:.1f} MB"
+
+
+def _start_pages() -> list[str]:
+    """The first page, and those of the sections that it names."""
+    lines = (ROOT / "docs/index.rst").read_text(encoding="utf-8").partition(".. toctree::")[2]
+    named = re.findall(r"(?m)^   ([\w/-]+)\*?$", lines)
+    return ["docs/index.html", *(f"docs/{name}.html" for name in named)]
+
+
+def _belongs_to_site(name: str) -> bool:
+    """Whether a file of an archive can be one of the site."""
+    folder, _, rest = name.partition("/")
+    if not rest:
+        return name.endswith(".html") or name in _FILES
+    return folder in _FILE_FOLDERS or (folder in _PAGE_FOLDERS and name.endswith(".html"))
 
 
 def check_platform(python: Path, wheel: Path) -> str:

@@ -15,6 +15,7 @@ from collections.abc import Callable, Iterator
 from pathlib import Path
 
 import checks
+from site_archive import build_site, pack_site
 from sources import unpack
 from wheels import ROOT, TARGETS, build_sdist, build_wheel
 
@@ -52,10 +53,12 @@ def _interpreter(versions: list[str]) -> str:
     )
 
 
-def planned(tools: Path, sdist: Path, wheels: dict[Path, Path]) -> Iterator[Check]:
+def planned(tools: Path, sdist: Path, docs: Path, wheels: dict[Path, Path]) -> Iterator[Check]:
     """The checks, in their order: subject, name, call."""
     yield "all", "metadata", lambda: checks.check_metadata(tools, [sdist, *wheels])
     yield "sdist", "citation", lambda: checks.check_citation(sdist)
+    yield "sdist", "description", lambda: checks.check_description(sdist)
+    yield "docs", "contents", lambda: checks.check_docs(docs)
     for wheel, python in wheels.items():
         name = "-".join(wheel.name.split("-")[2:4]) + wheel.stem.rpartition("manylinux_2_17")[2]
         folder = WORK / "installed" / name
@@ -95,20 +98,23 @@ def main() -> int:
     tools = pythons()
     print("dist: source distribution", flush=True)
     sdist = build_sdist(tools[-1], OUT)
+    print("dist: documentation", flush=True)
+    version = checks.version_of(sdist)
+    docs = pack_site(build_site(version, WORK), version, OUT)
     source = unpack(sdist, WORK / "source")
     wheels = {}
     for target, python in itertools.product(targets, tools):
         print(f"dist: {target}, {python.parents[1].name}", flush=True)
         wheels[build_wheel(python, target, source, WORK, OUT)] = python
     failed = 0
-    for subject, name, check in planned(tools[-1], sdist, wheels):
+    for subject, name, check in planned(tools[-1], sdist, docs, wheels):
         try:
             word, detail = "ok", check()
         except checks.CheckError as error:
             word, detail, failed = "FAILED", str(error), failed + 1
         print(f"{word:7} {subject:21} {name:18} {detail}", flush=True)
-    print(f"dist: {len(wheels)} wheels and the source distribution are in {OUT.name}/; "
-          f"{failed} checks failed.")  # fmt: skip
+    print(f"dist: {len(wheels)} wheels, the source distribution and the documentation are in "
+          f"{OUT.name}/; {failed} checks failed.")  # fmt: skip
     return 1 if failed else 0
 
 

@@ -14,7 +14,7 @@ import sys
 from dataclasses import dataclass
 from pathlib import Path
 
-__all__ = ["ROOT", "TARGETS", "Target", "build_sdist", "build_wheel"]
+__all__ = ["ROOT", "TARGETS", "Target", "build_sdist", "build_wheel", "run"]
 
 ROOT = Path(__file__).resolve().parents[1]
 TOOLS = Path(__file__).with_name("zig")
@@ -60,7 +60,7 @@ def build_sdist(python: Path, out: Path) -> Path:
     Returns:
         The archive.
     """
-    _run([python, "-m", "build", "--sdist", "--no-isolation", "--outdir", out, ROOT])
+    run([python, "-m", "build", "--sdist", "--no-isolation", "--outdir", out, ROOT])
     return max(out.glob("haselab-*.tar.gz"), key=lambda path: path.stat().st_mtime)
 
 
@@ -94,7 +94,7 @@ def build_wheel(python: Path, name: str, source: Path, work: Path, out: Path) ->
         "HASELAB_TOOLS": str(work / "tools"),
     }
     settings = [f"-Ccmake.define.{key}={value}" for key, value in defines.items()]
-    _run(
+    run(
         [python, "-m", "build", "--wheel", "--no-isolation", "--outdir", fresh,
          f"-Cbuild-dir={work / 'build'}", "-Cinstall.strip=false", *settings, source],
         environment,
@@ -131,7 +131,15 @@ def _ask(python: Path, code: str | None, *arguments: str) -> str:
     return subprocess.run(line, check=True, capture_output=True, text=True).stdout.strip()
 
 
-def _run(line: list[str | Path], more: dict[str, str] | None = None) -> None:
+def run(line: list[str | Path], more: dict[str, str] | None = None) -> None:
+    """Run a program; if it fails, show what it wrote and end.
+
+    Args:
+        line: the program and its arguments.
+        more: variables added to the environment.
+    Raises:
+        SystemExit: the program failed.
+    """
     done = subprocess.run(
         [str(part) for part in line], env={**os.environ, **(more or {})}, capture_output=True,
         text=True, check=False,

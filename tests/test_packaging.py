@@ -1,5 +1,7 @@
-"""Packages: the version, what a wheel contains, and processors without AVX."""
+"""Packages: the version, what each file contains, and processors without AVX."""
 
+import importlib
+import io
 import os
 import re
 import shutil
@@ -32,15 +34,19 @@ def run(line: list[object], folder: Path | None = None, **environment: str) -> s
     return done.stdout.strip()
 
 
+def module(name: str) -> ModuleType:
+    """A module of make dist."""
+    sys.path.insert(0, str(PACKAGING))
+    try:
+        return importlib.import_module(name)
+    finally:
+        sys.path.remove(str(PACKAGING))
+
+
 @pytest.fixture(scope="module")
 def checks() -> ModuleType:
     """The checks of make dist."""
-    sys.path.insert(0, str(PACKAGING))
-    try:
-        import checks
-    finally:
-        sys.path.remove(str(PACKAGING))
-    return checks
+    return module("checks")
 
 
 @pytest.fixture(scope="module")
@@ -147,6 +153,96 @@ def test_a_release_is_not_cited_as_another_version(checks: ModuleType) -> None:
     assert checks.check_citation(Path("haselab-9.0.0.dev3.tar.gz")) == "not a release"
     with pytest.raises(checks.CheckError, match=r"but the package's is 9\.0\.0"):
         checks.check_citation(Path("haselab-9.0.0.tar.gz"))
+
+
+def described(folder: Path, version: str, description: str) -> Path:
+    """A source distribution that contains only its metadata."""
+    sdist = folder / f"haselab-{version}.tar.gz"
+    text = f"Metadata-Version: 2.4\nName: haselab\n\n{description}".encode()
+    with tarfile.open(sdist, "w:gz") as opened:
+        entry = tarfile.TarInfo(f"haselab-{version}/PKG-INFO")
+        entry.size = len(text)
+        opened.addfile(entry, io.BytesIO(text))
+    return sdist
+
+
+@pytest.mark.parametrize(
+    "description",
+    ["see [safety](docs/bench/safety.md)", "![panel](docs/pictures/panel.gif)",
+     "[a][1]\n\n[1]: docs/faq.md", '<img alt="a" src="docs/pictures/bench.svg">'],
+)  # fmt: skip
+def test_a_release_whose_description_has_a_relative_link_is_found(
+    checks: ModuleType, tmp_path: Path, description: str
+) -> None:
+    with pytest.raises(checks.CheckError, match="1 relative links or pictures, such as docs/"):
+        checks.check_description(described(tmp_path, "9.0.0", description))
+    assert (
+        checks.check_description(described(tmp_path, "9.0.0.dev3", description)) == "not a release"
+    )
+
+
+def test_a_description_may_have_absolute_links_anchors_and_code(
+    checks: ModuleType, tmp_path: Path
+) -> None:
+    text = "[a](https://example.org/a) [b](#cite) `[c](d)`\n\n```\n[e](f)\n```\n"
+    sdist = described(tmp_path, "9.0.0", text)
+    assert checks.check_description(sdist) == "2 links, none relative"
+
+
+def made_up_site(folder: Path, checks: ModuleType) -> Path:
+    """The files that a site has at least, with their titles."""
+    names = "index.html", "searchindex.js", "_static/site.css", *checks._start_pages()
+    for name in (*names, ".buildinfo"):
+        path = folder / "site" / name
+        path.parent.mkdir(parents=True, exist_ok=True)
+        path.write_text("<title>A page &#8212; haselab 9.0.0</title>", encoding="utf-8")
+    return folder / "site"
+
+
+def test_the_documentation_is_one_archive(checks: ModuleType, tmp_path: Path) -> None:
+    site = made_up_site(tmp_path, checks)
+    archive = module("site_archive").pack_site(site, "9.0.0", tmp_path / "dist")
+    assert archive.name == "haselab-9.0.0-docs.zip"
+    with zipfile.ZipFile(archive) as opened:
+        names = set(opened.namelist())
+    assert {"haselab-9.0.0-docs/index.html", "haselab-9.0.0-docs/docs/start/index.html"} <= names
+    assert "haselab-9.0.0-docs/.buildinfo" not in names
+    pages = len(checks._start_pages()) + 1
+    assert pages > 8
+    assert checks.check_docs(archive) == f"{pages} pages, 0.0 MB"
+
+
+@pytest.mark.parametrize("name", ["index.html", "searchindex.js", "docs/how-to/index.html"])
+def test_a_page_that_the_documentation_lacks_is_found(
+    checks: ModuleType, tmp_path: Path, name: str
+) -> None:
+    site = made_up_site(tmp_path, checks)
+    (site / name).unlink()
+    archive = module("site_archive").pack_site(site, "9.0.0", tmp_path)
+    with pytest.raises(checks.CheckError, match=f"1 faults, such as: {name} is missing"):
+        checks.check_docs(archive)
+
+
+@pytest.mark.parametrize(
+    "name",
+    ["doctrees/docs/faq.doctree", "notebooks/global.db", "reference/report.html",
+     "docs/environment.pickle", "twin-actuator.toml"],
+)  # fmt: skip
+def test_a_file_of_out_that_is_not_the_site_is_found(
+    checks: ModuleType, tmp_path: Path, name: str
+) -> None:
+    site = made_up_site(tmp_path, checks)
+    (site / name).parent.mkdir(parents=True, exist_ok=True)
+    (site / name).write_text("not a page", encoding="utf-8")
+    archive = module("site_archive").pack_site(site, "9.0.0", tmp_path)
+    with pytest.raises(checks.CheckError, match=f"1 faults, such as: {name} is not of the site"):
+        checks.check_docs(archive)
+
+
+def test_documentation_of_another_version_is_found(checks: ModuleType, tmp_path: Path) -> None:
+    archive = module("site_archive").pack_site(made_up_site(tmp_path, checks), "9.0.1", tmp_path)
+    with pytest.raises(checks.CheckError, match=r"does not name haselab 9\.0\.1"):
+        checks.check_docs(archive)
 
 
 OLD_PROCESSOR = """

@@ -166,3 +166,12 @@ def test_every_public_name_is_in_the_reference(site: Path, package: str) -> None
     module = importlib.import_module(package)
     packages = {name for name in module.__all__ if f"{package}.{name}" in PACKAGES}
     assert not {*module.__all__} - packages - linked
+
+
+def test_the_reference_leads_to_the_source_which_has_colours(site: Path) -> None:
+    page = _page(site / "docs" / "reference" / "api" / "haselab.sensing.html")
+    sources = {address.partition("#")[0] for _, address in page.links if "_modules/" in address}
+    assert sources
+    for address in sources:
+        path = site / "docs" / "reference" / "api" / address
+        assert '<span class="k">' in path.read_text(encoding="utf-8"), address

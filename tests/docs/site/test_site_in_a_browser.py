@@ -15,7 +15,7 @@ SECTIONS = (
     "docs/measure/sensing.html", "docs/concepts/what-an-interval-means.html",
     "docs/identify/which-model.html", "docs/reference/commands/sense.html",
     "docs/reference/api/haselab.sensing.html", "docs/reference/files.html", "docs/gallery.html",
-    "ARCHITECTURE.html",
+    "ARCHITECTURE.html", "_modules/haselab/identify/creep/fit.html",
 )  # fmt: skip
 
 

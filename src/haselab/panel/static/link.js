@@ -47,7 +47,7 @@ export class Link extends Requests {
     };
     socket.onclose = ({ code, reason }) => {
       if (socket !== this.socket) return;
-      this.problem = code === 1008 ? `The server refused this page (${reason || "wrong address"}). Open the address that haselab panel printed.` : "";
+      if (code === 1008) this.problem = `The server refused this page (${reason || "wrong address"}). Open the address that haselab panel printed.`;
       this.socket = null;
       this.lost();
       this.onChange();
@@ -87,7 +87,11 @@ export class Link extends Requests {
 
   framed(buffer) {
     const head = new DataView(buffer);
-    if (head.getUint16(0, true) !== SCHEMA) { location.reload(); return; }
+    if (head.getUint16(0, true) !== SCHEMA) { // no reload of its own: it would lose what is not saved
+      this.problem = "This page belongs to another version of the panel. Reload it.";
+      this.socket.close();
+      return;
+    }
     const number = head.getUint32(4, true);
     const [monitorStart, monitorStep, signalStart, signalStep] = [8, 16, 24, 32].map((at) => head.getFloat64(at, true));
     const size = head.getUint32(40, true), columns = head.getUint32(44, true);

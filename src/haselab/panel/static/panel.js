@@ -3,6 +3,7 @@ import { Charts } from "/static/charts.js";
 import { Link } from "/static/link.js";
 import { Arming, Playing, Progress, Said, kilo, limitOf } from "/static/bench.js";
 import { Range, useNumber } from "/static/number.js";
+import { unsaved } from "/static/requests.js";
 
 const STALE_MS = 450;
 const LOST_MS = 1500; // without data: what is shown of the bench is old, and commands are useless
@@ -18,8 +19,7 @@ const link = new Link((found) => {
 }, () => redraw());
 
 window.stopBesides = () => link.ask("stop");
-const leaving = { asks: false }; // while this page has armed the bench
-addEventListener("beforeunload", (event) => { if (leaving.asks) event.preventDefault(); });
+addEventListener("beforeunload", (event) => { if (unsaved.size > 0) event.preventDefault(); });
 
 // Pauses three times as long as a draw took, but for 1 s at most, so that a slow computer is free for STOP.
 async function drawNewest() {
@@ -166,7 +166,7 @@ function Panel() {
   document.body.classList.toggle("stale", stale);
   document.body.classList.toggle("paused", paused);
   document.body.classList.toggle("lost", lost);
-  leaving.asks = mine && !lost;
+  if (mine && !lost) unsaved.add("armed"); else unsaved.delete("armed");
   const stage = state ? `${STAGES[state.stage] ?? state.stage}${live ? `, ${kilo(state.drive_v, state.gain)}` : ""}` : "";
   const bench = state === null ? "Bench: unknown" : stale ? `Bench: unknown (last: ${stage})` : `Bench: ${stage}`;
   const corner = document.getElementById("corner-state"), said = stale ? `${age}. ${bench}` : bench;

@@ -81,6 +81,7 @@ export class Charts {
     const axis = axisOf();
     const plot = new uPlot({
       width: Math.max(card.clientWidth - 24, 200), height: HEIGHT, series, bands, legend: { show: false },
+      padding: [null, null, null, (u, side, sides) => (sides[side] ? 0 : 90)], // without data there is no left axis, but all time axes are aligned
       scales: { x: { time: false }, y: { range: heights(about.least) } },
       axes: [{ ...axis, size: 32, values: seconds }, { ...axis, size: 70, space: 20, label: about.unit, labelSize: 20, values: numbers }],
       cursor: { sync: { key: "haselab" }, drag: { x: true, y: false, setScale: false } },

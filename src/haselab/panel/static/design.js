@@ -215,7 +215,7 @@ export default function Design({ link, state }) {
         <${Margins} found=${found.margins} caption=${`At ${digits(found.margins.rate_hz)} Hz with a delay of ${digits(1e3 * found.margins.delay_s)} ms`} />
         ${gains !== null && html`<div>
           ${!same(demands?.gains ?? null, gains) ? html`<p>Checking the demands …</p>` : demands.error ? html`<p class="error">${demands.error}</p>` : html`
-            ${demands.shortfalls.length ? html`<p class="error">Demands not met for the worst natural frequency within frequency_spread: ${demands.shortfalls.join("; ")}.</p>` : html`<p>All demands are met.</p>`}
+            ${demands.shortfalls.length ? html`<p class="error">Demands not met for the worst natural frequency within frequency_spread: ${demands.shortfalls.join("; ")}.</p>` : html`<p>All demands are met. They apply to the identified plant, also with its natural frequency changed by frequency_spread.</p>`}
             <p>${demands.plausible}.</p>`}</div>`}
       </div>`}
       ${isShown && found.chip && html`<div class=${`card ${isNew ? "" : "old"}`}><h2>On the ATmega2560</h2>

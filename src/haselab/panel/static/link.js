@@ -15,6 +15,7 @@ export class Link extends Requests {
     this.problem = "";
     this.framedAt = -Infinity;
     this.blockAge = 0; // when the last frame was sent, in s
+    this.stateAge = 0; // when the last frame was sent, in s
     this.clock = 0; // of the bench process in the last frame, in s; the process refuses commands with an old time
     this.patience = SILENT_MS; // with a socket that is connecting
     this.waiting = new Map();
@@ -26,6 +27,9 @@ export class Link extends Requests {
 
   // Of the last block that the bench has read.
   get age_ms() { return this.silent_ms + 1000 * this.blockAge; }
+
+  // Of the state of the bench, which its process also sends without new data.
+  get stateAge_ms() { return this.silent_ms + 1000 * this.stateAge; }
 
   get silent_ms() { return performance.now() - this.framedAt; }
 
@@ -112,6 +116,7 @@ export class Link extends Requests {
     this.framedAt = performance.now();
     this.patience = SILENT_MS;
     this.blockAge = about.age_s;
+    this.stateAge = about.state_age_s;
     this.clock = about.clock_s;
     this.send({ ack: number });
     this.onFrame({ ...about, monitors, signals });

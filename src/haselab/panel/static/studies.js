@@ -46,8 +46,7 @@ function Chooser({ link, state, mine, onEnd }) {
   if (busy && state.mode === "study") return html`<div class="card warning"><h2>Study</h2>
     <p class="badge live">Another page plays a study, up to ${limitOf(state)}</p><${Progress} state=${state} /></div>`;
   if (list === null) return html`<div class="card"><h2>Study</h2><p class=${error ? "error" : ""} role="status">${error || "Reading the studies …"}</p></div>`;
-  const blocked = busy && html`<div class="row" role="status"><span>${mine ? "This page has armed the bench. Disarm it before you play a study." : "The bench is armed by another page. Disarm it there before you play a study."}
-    The list of studies cannot be opened meanwhile: it would take the key of STOP.</span>${mine && html`<button type="button" onClick=${disarm}>Disarm</button>`}</div>`;
+  const blocked = busy && html`<div class="row" role="status"><span>${mine ? "This page has armed the bench. Disarm it before you play a study." : "The bench is armed by another page. Disarm it there before you play a study."} The list of studies cannot be opened meanwhile: it would take the key of STOP.</span>${mine && html`<button type="button" onClick=${disarm}>Disarm</button>`}</div>`;
   const titles = list.find((one) => one.name === chosen.study)?.experiments ?? [];
   const toggle = (table, on) => change({ experiments: titles.map((one) => one.table).filter((one) => (one === table ? on : chosen.experiments.includes(one))) });
   // Planned on the clock of the bench; a file that cannot be planned has none.

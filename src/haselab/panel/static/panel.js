@@ -6,6 +6,7 @@ import { Range, stepsOf, useNumber } from "/static/number.js";
 import { unsaved } from "/static/requests.js";
 
 const STALE_MS = 450;
+const ANSWERED_MS = 350; // since the last state of a twin that computes; looked at every 100 ms
 const LOST_MS = 1500; // without data: what is shown of the bench is old, and commands are useless
 const MOST_PAUSE_MS = 1000; // between two draws
 let frame = null;
@@ -170,7 +171,7 @@ function Panel() {
   }, []);
   const state = frame?.state?.stage ? frame.state : null;
   // A twin that computes still sends its state, and says so; the bench is silent if this state is old, too.
-  const computing = link.age_ms > STALE_MS && Boolean(state?.computing) && link.stateAge_ms < STALE_MS;
+  const computing = link.age_ms > STALE_MS && Boolean(state?.computing) && link.stateAge_ms < ANSWERED_MS;
   const stale = link.age_ms > STALE_MS && !computing, lost = link.age_ms > LOST_MS && !computing;
   const seconds = link.age_ms / 1000;
   const age = !Number.isFinite(seconds) ? "NO DATA YET" : computing ? `The simulated bench is computing: no new data for ${seconds.toFixed(1)} s` : `NO NEW DATA for ${seconds.toFixed(1)} s`;

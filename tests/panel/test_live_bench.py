@@ -108,6 +108,38 @@ def test_a_study_that_computes_with_an_output_is_taken_to_zero_when_it_must_end(
     assert seen == [0.0]
 
 
+@pytest.mark.skipif(not hasattr(time, "pthread_getcpuclockid"), reason="not on this system")
+def test_a_twin_says_that_it_computes_and_not_that_it_waits(
+    bench: tuple[LiveBench, GuardedRig], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """By the processor time of the thread that plays, so a driver that hangs is no computation."""
+    live, rig = bench
+    seen: dict[str, bool] = {}
+    phase = ["none"]
+
+    def look() -> None:
+        while phase[0] != "over":
+            seen[phase[0]] = live.state.computing  # the last of each phase
+            time.sleep(0.02)
+
+    def playing(study: Any, rig: GuardedRig, options: Any, progress: Any) -> None:
+        end_s = time.monotonic() + 1.0
+        while time.monotonic() < end_s:
+            sum(range(1000))
+        phase[0] = "waits"
+        time.sleep(1.0)
+        phase[0] = "over"
+
+    monkeypatch.setattr(study_player, "run_study", playing)
+    watching = threading.Thread(target=look)
+    watching.start()
+    live.step()
+    watching.join()
+    assert seen == {"none": True, "waits": False}
+    assert not live.state.computing
+    rig.safety.trip("the end")
+
+
 def test_a_stop_during_a_computation_shows_the_drive_of_the_output(
     bench: tuple[LiveBench, GuardedRig], monkeypatch: pytest.MonkeyPatch
 ) -> None:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import threading
 import time
 
@@ -16,7 +17,26 @@ __all__ = ["CHECK", "ArmedStudy"]
 
 CHECK = "Check the instruments, then arm the bench again."
 _CATCH_UP_S, _WATCH_S = 0.2, 0.1
+_RECENT_S = 0.2  # since a thread last used the processor: longer, and it waits
 _COMPUTES_S = 0.5  # without a block: the study computes and does not check whether it must end
+
+
+class _Busy:
+    """Whether the thread that makes this object computes, by its processor time."""
+
+    def __init__(self) -> None:
+        known = hasattr(time, "pthread_getcpuclockid")  # not on macOS
+        self._clock = time.pthread_getcpuclockid(threading.get_ident()) if known else None
+        self._used_s, self._seen_s = 0.0, -math.inf
+
+    def look(self) -> bool:
+        """Look again, several times in `_RECENT_S`; from one thread while the other one lives."""
+        if self._clock is None:
+            return False
+        now_s, used_s = time.monotonic(), time.clock_gettime(self._clock)
+        if used_s > self._used_s + 1e-3:  # a thread that only waits uses less
+            self._used_s, self._seen_s = used_s, now_s
+        return now_s < self._seen_s + _RECENT_S
 
 
 class ArmedStudy:
@@ -32,9 +52,15 @@ class ArmedStudy:
         self._rig, self._leases, self.player = rig, leases, player
         self._page = ""  # that has armed the bench
         self._end = ""  # why the study must end; empty: it may go on
+        self._busy: _Busy | None = None  # of the thread that plays
         self._block_s = 0.0  # when the last block was read
         self.job: StudyJob | None = None  # that is due or played
         self.recorded = ""  # folder of the last study that was played to its end
+
+    def computes(self) -> bool:
+        """Whether the thread that plays a study has just used the processor."""
+        busy = self._busy
+        return busy is not None and busy.look()
 
     def begin(self, page: str, job: StudyJob) -> None:
         """The bench was armed for a study.
@@ -72,7 +98,7 @@ class ArmedStudy:
         Returns:
             Why it has ended. After a fault of a disk or a driver the bench has tripped.
         """
-        folder, over = job.options.folder, threading.Event()
+        folder, over, self._busy = job.options.folder, threading.Event(), _Busy()
         threading.Thread(target=self._watch, args=(over,), daemon=True).start()
         try:
             self.player.play(job, self._rig, self.why_not, picture)
@@ -87,6 +113,7 @@ class ArmedStudy:
             return self._tripped(f"A driver or an experiment failed: {described(error)}. {CHECK}")
         finally:
             over.set()
+            self._busy = None
             self._rig.safety.record_with(lambda what: None)  # the recording is closed
         return f"The study has ended. Its recording is in {folder}."
 

@@ -35,7 +35,7 @@ from dataclasses import asdict, replace
 from pathlib import Path
 
 from haselab.api.design import Actuator
-from haselab.base import HaselabError, InputError, JsonObject, is_real
+from haselab.base import HaselabError, InputError, JsonObject, LimitError, is_real
 from haselab.panel.columns import LiveWriter
 from haselab.panel.files import PanelFiles
 from haselab.panel.live_bench import CARRIER_HZ, LiveBench
@@ -123,7 +123,7 @@ class _Link:
                 float(at_s) if is_real(at_s) else -math.inf,
             )  # fmt: skip
         except HaselabError as error:
-            return {"id": number, "error": str(error)}
+            return {"id": number, "error": str(error), "limit": isinstance(error, LimitError)}
         except Exception as error:  # other commands must still be answered
             traceback.print_exc()
             return {"id": number, "error": f"The command failed: {error!r}. See the terminal."}

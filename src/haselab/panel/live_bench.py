@@ -47,6 +47,7 @@ _MOST_EVENTS = 40  # that a page shows
 _RECENT = ("arm", "drive", "loop", "open", "confirm")  # an old command could energise the bench
 _SHOWN_DIGITS = 5e-6  # a page shows the limits of the strain with six digits
 _REOPEN_S = 1.0  # between two attempts to open the board again
+_LEAST_V = 0.001  # that can be typed: pages show three decimals
 _TYPED = "the limit typed on the page"
 
 
@@ -141,7 +142,8 @@ class LiveBench:
             about.amplifier_gain, limits, about.name, self._rig.simulated, self._player.task,
             self._player.done, self._player.prompt, self._player.step, tuple(self._events),
             self._study.recorded, "" if job is None else job.options.folder.name,
-            self._signals.extrapolated,
+            self._requester if stage is Stage.REQUESTED else "",
+            self._rig.simulated and self._study.computes(), self._signals.extrapolated,
         )  # fmt: skip
 
     def do(
@@ -292,9 +294,9 @@ class LiveBench:
         self._require_idle()
         limit_v, request = number(values, "limit_v"), self._find_request(values)
         limits = self._rig.description.drive_limits
-        if not 0.0 < limit_v <= limits.high:
+        if not _LEAST_V <= limit_v <= limits.high:
             raise LimitError(
-                f"The typed limit is {limit_v:g} V, but it must be above 0 and at most "
+                f"The typed limit is {limit_v:g} V, but it must be {_LEAST_V:g} to "
                 f"{limits.high:g} V. Type another one."
             )
         highest_v = 0.0 if job is None else job.highest_v(self._rig.description)

@@ -50,7 +50,8 @@ __all__ = ["SCHEMA", "WebSettings", "application"]
 
 SCHEMA = 1  # of a binary frame
 _FRAME_S = 1.0 / 30.0
-_REPEAT_S = 0.3  # after which a frame is sent without new data, while the bench process answers
+_REPEAT_S = 0.15  # after which a frame is sent without new data, while the bench process answers
+_ANSWERS_S = 0.3  # since its last state
 _TOKEN_S = 3.0  # for the first message of a page
 _MOST_PAGES, _MOST_UNKNOWN = 32, 64  # with the token; without it yet
 _MOST_BYTES = 4096  # of a message of a page
@@ -128,7 +129,7 @@ class _Bench:
     async def _take(self, state: dict[str, Any]) -> None:
         """Keep the state of the bench; analyse a study that has just been recorded."""
         before = self.state
-        self.state, self.state_s = state, asyncio.get_running_loop().time()
+        self.state, self.state_s = state, time.monotonic()
         self.state_text = json.dumps(state)
         if before is not None and state["recorded"] != before["recorded"]:
             with contextlib.suppress(HaselabError, OSError):  # the page offers it again
@@ -338,7 +339,7 @@ class _Server:
                     self._start(self._renew(page))
                 blocks = self._bench.reader.blocks if self._bench.reader else -1
                 age_s = self._bench.age_s()
-                answers = loop.time() < self._bench.state_s + _REPEAT_S
+                answers = time.monotonic() < self._bench.state_s + _ANSWERS_S
                 repeats = int(age_s / _REPEAT_S) if answers and age_s < math.inf else 0
                 now = (blocks, page.view, self._bench.state_text, repeats)
                 if now == last:
@@ -384,6 +385,7 @@ class _Server:
             "end_s": end_s,
             "gap_s": gap_s,
             "age_s": min(self._bench.age_s(), 1e9),
+            "state_age_s": min(time.monotonic() - self._bench.state_s, 1e9),
             "written_s": reader.written_s if reader is not None else math.nan,
         }
         known = {name: None if math.isnan(at_s) else at_s for name, at_s in times.items()}

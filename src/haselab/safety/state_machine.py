@@ -252,10 +252,15 @@ class Safety:
             SafetyError: The request is not the last one or was used, its reason was not
                 acknowledged, or the bench was made safe meanwhile.
         """
-        if request is not self._open or self._stage is not Stage.REQUESTED:
+        if request is not self._open and request.number != self._number:
             raise SafetyError(
                 f"Arming request {request.number} is no longer valid (the last one is "
                 f"{self._number}). Request arming again."
+            )
+        if request is not self._open or self._stage is not Stage.REQUESTED:
+            raise SafetyError(
+                f"Arming request {request.number} is no longer valid: it was used or withdrawn, or "
+                "the bench was stopped meanwhile. Request arming again."
             )
         if request.reason and acknowledged != request.reason:
             raise SafetyError(
@@ -384,7 +389,7 @@ class Safety:
     def revoked_by_others(self) -> str:
         """What made the bench safe while this program had a permission; empty if nothing did."""
         why = self.gate.revoked if self._stage in LIVE else ""
-        return f"Another program made the bench safe: {why.rstrip('.')}." if why else ""
+        return f"The permission of the bench was revoked: {why.rstrip('.')}." if why else ""
 
     def _trip_once(self, reason: str) -> bool:
         """Revoke the permission before anything else; return whether this is the first reason."""

@@ -188,7 +188,18 @@ def test_the_numbers_of_a_picture(browser: Browser, tmp_path: Path) -> None:
                 expect(page.locator(".number")).to_be_visible()
             assert "pick-region" not in watched.sent
             assert not list(video.parent.glob("*-points.csv"))
+            most.fill("5001")
+            most.blur()  # also before anything is pressed
+            expect(page.locator(".number")).to_contain_text("Type at most 5000.")
             most.fill("20")
+            name = page.get_by_label("File name of the table")
+            name.fill(" ")
+            page.get_by_role("button", name="Save 1 points").click()
+            expect(page.locator(".number")).to_contain_text("Type a file name")
+            expect(name).to_be_focused()
+            assert "pick-save" not in watched.sent
+            name.fill("points.csv")
+            expect(page.locator(".number")).to_have_count(0)
             page.get_by_role("button", name="Find the dots").click()
             watched.expect_sent("pick-region")
     finally:

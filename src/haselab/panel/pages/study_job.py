@@ -11,13 +11,15 @@ from dataclasses import dataclass
 from datetime import datetime
 from pathlib import Path
 
-from haselab.base import InputError, JsonObject, shown
+from haselab.base import HaselabError, InputError, Json, JsonObject, shown
 from haselab.models.actuator import ActuatorTables
 from haselab.panel.files import PanelFiles
 from haselab.pipelines.design.model_file import read_tables
 from haselab.rig import RigDescription
+from haselab.rig.bench_config import BenchConfig
 from haselab.rig.operator import OperatorWeights
 from haselab.rig.rig_file import RigFile, TwinFile, load_rig
+from haselab.rig.twin.twin_bench import describe
 from haselab.runtime.camera_recorder import KeepVideo
 from haselab.store.actuator_file import ACTUATOR
 from haselab.store.folder import write_text
@@ -123,15 +125,53 @@ def available(files: PanelFiles) -> JsonObject:
     Args:
         files: of the panel.
     Returns:
-        `studies`: each with `name` and `experiments`, their tables and titles.
+        `studies`: each with `name` and `experiments`: their tables, titles, and planned `seconds`
+        on the clock of the bench, in full and in the short version; null if that is not known.
     """
-    found: list[JsonObject] = [{"name": _REFERENCE, "experiments": _experiments(builtin_study())}]
-    for path in _study_files(files):
+    rig, tables = _described(files), None
+    with contextlib.suppress(InputError):  # the check says what is wrong with the file
+        tables = _tables(files)
+    found: list[JsonObject] = []
+    for name in [_REFERENCE, *map(str, _study_files(files))]:
         try:
-            found.append({"name": str(path), "experiments": _experiments(load_study(path))})
+            full, short = (_study_of(name, quick=quick) for quick in (False, True))
         except InputError:  # another kind of file
             continue
+        played = [_seconds(study, rig, tables) for study in (full, short)]
+        listed: list[Json] = [
+            one | {"seconds": [seconds.get(str(one["table"])) for seconds in played]}
+            for one in _experiments(full)
+        ]
+        found.append({"name": name, "experiments": listed})
     return {"studies": found}
+
+
+def _described(files: PanelFiles) -> RigDescription | None:
+    """The rig of the file; None if it cannot be described."""
+    with contextlib.suppress(InputError):
+        file = load_rig(files.rig)
+        if isinstance(file, TwinFile):
+            return describe(file.configuration(files.rig))
+        if isinstance(file, BenchConfig):
+            return file.describe()
+    return None
+
+
+def _seconds(
+    study: Study, rig: RigDescription | None, tables: ActuatorTables | None
+) -> dict[str, float]:
+    """Planned time of each experiment; none that cannot be planned."""
+    found: dict[str, float] = {}
+    with contextlib.suppress(HaselabError):
+        if rig is not None:
+            if tables is not None:
+                study = with_actuator_tables(study, tables)
+            found = {one.table: float(one.seconds(rig)) for one in experiments_of(study)}
+    return found
+
+
+def _study_of(name: str, *, quick: bool) -> Study:
+    return builtin_study(quick=quick) if name == _REFERENCE else load_study(Path(name), quick=quick)
 
 
 def _experiments(study: Study) -> list[JsonObject]:
@@ -152,10 +192,8 @@ def chosen_study(files: PanelFiles, values: JsonObject) -> Study:
         InputError: there is no such study or experiment, or no result can come from it.
     """
     name, quick = values.get("study"), values.get("quick") is True
-    if name == _REFERENCE:
-        study = builtin_study(quick=quick)
-    elif name in [str(path) for path in _study_files(files)]:
-        study = load_study(Path(str(name)), quick=quick)
+    if name == _REFERENCE or name in [str(path) for path in _study_files(files)]:
+        study = _study_of(str(name), quick=quick)
     else:
         raise InputError(
             f"There is no study {shown(name)} in this folder. Choose one from the list."

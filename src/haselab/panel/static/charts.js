@@ -8,6 +8,21 @@ export const resolved = (name) => { // light-dark() is resolved by the browser, 
   return found;
 };
 
+// The colours of all plots, which read them at each draw. A change must not reload the page: that would end a run.
+export const colours = {};
+const painted = new Set(); // plots that are drawn again when the system becomes light or dark
+function paint() {
+  for (const name of ["text", "line", "first", "second", "soft"]) colours[name] = resolved(`--${name}`);
+  for (const plot of painted) plot.redraw(false);
+}
+paint();
+matchMedia("(prefers-color-scheme: dark)").addEventListener("change", paint);
+export function follow(plot) { // until the function that this returns is called
+  painted.add(plot);
+  return () => painted.delete(plot);
+}
+export const axisOf = () => ({ stroke: () => colours.text, grid: { stroke: () => colours.line, width: 1 }, ticks: { stroke: () => colours.line } });
+
 const HEIGHT = 130;
 // least: lowest height of the axis, in its unit, so that rounding errors do not fill a plot.
 const PLOTS = [
@@ -43,7 +58,6 @@ export class Charts {
     addEventListener("mouseup", () => { this.dragged = false; });
     this.plots = PLOTS.map((about) => this.make(root, about));
     new ResizeObserver(() => this.resize()).observe(root);
-    matchMedia("(prefers-color-scheme: dark)").addEventListener("change", () => location.reload());
   }
 
   make(root, about) {
@@ -56,23 +70,23 @@ export class Charts {
     values.className = "values";
     card.append(values);
     root.append(card);
-    const text = resolved("--text"), line = resolved("--line");
     const series = [{ label: "time" }];
     const bands = [];
     about.lines.forEach((one, k) => {
-      const stroke = resolved(k ? "--second" : "--first");
+      const stroke = () => colours[k ? "second" : "first"];
       series.push({ label: `${one.name}, highest`, stroke, width: 1, points: { show: false } });
       series.push({ label: `${one.name}, lowest`, stroke, width: 1, points: { show: false } });
-      bands.push({ series: [2 * k + 1, 2 * k + 2], fill: stroke.replace("rgb(", "rgba(").replace(")", ", 0.35)") });
+      bands.push({ series: [2 * k + 1, 2 * k + 2], fill: () => stroke().replace("rgb(", "rgba(").replace(")", ", 0.35)") });
     });
-    const axis = { stroke: text, grid: { stroke: line, width: 1 }, ticks: { stroke: line } };
+    const axis = axisOf();
     const plot = new uPlot({
       width: Math.max(card.clientWidth - 24, 200), height: HEIGHT, series, bands, legend: { show: false },
+      padding: [null, null, null, (u, side, sides) => (sides[side] ? 0 : 90)], // without data there is no left axis, but all time axes are aligned
       scales: { x: { time: false }, y: { range: heights(about.least) } },
       axes: [{ ...axis, size: 32, values: seconds }, { ...axis, size: 70, space: 20, label: about.unit, labelSize: 20, values: numbers }],
       cursor: { sync: { key: "haselab" }, drag: { x: true, y: false, setScale: false } },
       hooks: {
-        draw: [(u) => this.mark(u, text)],
+        draw: [(u) => this.mark(u, colours.text)],
         setSelect: [(u) => {
           if (u.select.width < 3) return;
           const from = u.posToVal(u.select.left, "x"), to = u.posToVal(u.select.left + u.select.width, "x");
@@ -81,6 +95,7 @@ export class Charts {
         }],
       },
     }, series.map(() => []), card);
+    follow(plot);
     plot.over.addEventListener("mousedown", () => { this.dragged = true; }); // the view stays meanwhile
     plot.over.addEventListener("dblclick", () => this.onZoom({ key: "End" }));
     return { about, plot, card, values };

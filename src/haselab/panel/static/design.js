@@ -1,8 +1,9 @@
 // Margins, frequency response and step of the identified model, with gains to drag.
 import { html, useState, useEffect, useRef } from "/static/vendor/htm-preact.js";
-import { resolved } from "/static/charts.js";
+import { axisOf, colours, follow } from "/static/charts.js";
 import { Said } from "/static/bench.js";
 import { Range, useNumber } from "/static/number.js";
+import { unsaved } from "/static/requests.js";
 
 const STEPS = 400; // of a slider; 0 is a gain of 0, the rest is logarithmic
 const DECADES = 4;
@@ -47,19 +48,18 @@ class Latest {
 function Plot({ about, x, lines, label, unit }) {
   const place = useRef(null), plot = useRef(null);
   useEffect(() => {
-    const text = resolved("--text"), line = resolved("--line"), colours = [resolved("--first"), resolved("--second"), resolved("--soft")];
-    const axis = { stroke: text, grid: { stroke: line, width: 1 }, ticks: { stroke: line } };
-    const isBode = about.of === "bode", of = isBode ? colours : [colours[0], colours[2]];
+    const axis = axisOf(), isBode = about.of === "bode", of = isBode ? ["first", "second", "soft"] : ["first", "soft"];
     plot.current = new uPlot({
       width: Math.max(place.current.clientWidth, 200), height: HEIGHT, legend: { show: false },
-      series: [{}, ...about.names.map((name, k) => ({ label: name, stroke: of[k], width: k < 1 ? 2 : 1, dash: k > 0 && k === about.names.length - 1 ? [6, 4] : undefined, points: { show: false } }))],
+      series: [{}, ...about.names.map((name, k) => ({ label: name, stroke: () => colours[of[k]], width: k < 1 ? 2 : 1, dash: k > 0 && k === about.names.length - 1 ? [6, 4] : undefined, points: { show: false } }))],
       scales: { x: { time: false, distr: isBode ? 3 : 1, range: (u, low, high) => [low, high] }, y: about.key === "phase" ? { range: (u, low, high) => uPlot.rangeNum(Math.max(low, LEAST_DEG), high, 0.1, true) } : {} },
       axes: [{ ...axis, label: isBode ? "Frequency (Hz)" : "Time (s)", labelSize: 20 }, { ...axis, size: 60, label: unit ? `${about.title} (${unit})` : about.title, labelSize: 20 }],
       cursor: { drag: { x: false, y: false }, sync: isBode ? { key: "bode" } : undefined },
     }, [[], ...about.names.map(() => [])], place.current);
     const watcher = new ResizeObserver(() => plot.current.setSize({ width: Math.max(place.current.clientWidth, 200), height: HEIGHT }));
     watcher.observe(place.current);
-    return () => { watcher.disconnect(); plot.current.destroy(); };
+    const forget = follow(plot.current);
+    return () => { forget(); watcher.disconnect(); plot.current.destroy(); };
   }, []);
   useEffect(() => { if (plot.current) plot.current.setData([x, ...lines]); }, [x, lines]);
   return html`<section class="card"><p class="values">${label}</p><div role="img" aria-label=${`${about.title}. ${label}`} ref=${place}></div></section>`;
@@ -133,12 +133,18 @@ export default function Design({ link, state }) {
       demands: new Latest(async (values) => ({ ...(await link.request("design-demands", values)), gains: values }), setDemands),
     };
   }
-  const change = (next) => { unwritten = next; setGains(next); };
+  function change(next, file = about) {
+    const isChanged = !same(next, file.gains);
+    unwritten = isChanged ? next : null;
+    if (isChanged) unsaved.add("gains"); else unsaved.delete("gains");
+    setGains(next);
+  }
   async function open() {
     const answer = await link.request("design");
     see(answer);
     find(answer.found ?? null);
-    setGains(answer.gains ? unwritten ?? answer.gains : null);
+    if (answer.gains) change(unwritten ?? answer.gains, answer);
+    else setGains(null);
   }
   const reopen = () => { unwritten = null; say({ text: "", bad: false }); return open(); };
   useEffect(() => { open(); }, []);
@@ -168,8 +174,9 @@ export default function Design({ link, state }) {
     const answer = await during("write", () => link.request("design-write", { ...gains, sha256: about.sha256 }));
     if (answer.error) say({ text: answer.error, bad: true });
     else {
-      unwritten = null;
-      see({ ...about, sha256: answer.sha256 });
+      const file = { ...about, gains: { ...gains }, sha256: answer.sha256 };
+      see(file);
+      change(gains, file);
       find((last) => ({ ...last, sha256: answer.sha256 })); // or it would look changed until the next answer
       const next = state?.holder ? "The armed bench keeps its present controller. Disarm it and arm it again to use the new one." : "Press Arm the bench on the page Live to use it.";
       say({ text: `Written to ${answer.written}. ${next}`, bad: false });
@@ -200,14 +207,15 @@ export default function Design({ link, state }) {
         ${gains !== null && html`<div class="row">
           <button type="button" disabled=${busy !== ""} onClick=${compute}>${busy === "compute" ? "Computing …" : "Compute gains"}</button>
           <button type="button" disabled=${busy !== ""} onClick=${reopen}>Read the file again</button>
-          <button type="button" disabled=${busy !== "" || !isShown} onClick=${write}>Write to the actuator file</button></div>`}
+          <button type="button" disabled=${busy !== "" || !isShown} onClick=${write}>Write to the actuator file</button>
+          ${unwritten !== null && html`<strong class="changed" role="status">Changed, not written</strong>`}</div>`}
         <${Said} error=${said.bad ? said.text : ""} done=${said.text} />
       </div>
       ${isShown && html`<div class=${`card ${isNew ? "" : "old"}`}><h2>Margins</h2>
         <${Margins} found=${found.margins} caption=${`At ${digits(found.margins.rate_hz)} Hz with a delay of ${digits(1e3 * found.margins.delay_s)} ms`} />
         ${gains !== null && html`<div>
           ${!same(demands?.gains ?? null, gains) ? html`<p>Checking the demands …</p>` : demands.error ? html`<p class="error">${demands.error}</p>` : html`
-            ${demands.shortfalls.length ? html`<p class="error">Demands not met for the worst natural frequency within frequency_spread: ${demands.shortfalls.join("; ")}.</p>` : html`<p>All demands are met.</p>`}
+            ${demands.shortfalls.length ? html`<p class="error">Demands not met for the worst natural frequency within frequency_spread: ${demands.shortfalls.join("; ")}.</p>` : html`<p>All demands are met. They apply to the identified plant, also with its natural frequency changed by frequency_spread.</p>`}
             <p>${demands.plausible}.</p>`}</div>`}
       </div>`}
       ${isShown && found.chip && html`<div class=${`card ${isNew ? "" : "old"}`}><h2>On the ATmega2560</h2>

@@ -15,6 +15,7 @@ export class Link extends Requests {
     this.problem = "";
     this.framedAt = -Infinity;
     this.blockAge = 0; // when the last frame was sent, in s
+    this.stateAge = 0; // when the last frame was sent, in s
     this.clock = 0; // of the bench process in the last frame, in s; the process refuses commands with an old time
     this.patience = SILENT_MS; // with a socket that is connecting
     this.waiting = new Map();
@@ -26,6 +27,9 @@ export class Link extends Requests {
 
   // Of the last block that the bench has read.
   get age_ms() { return this.silent_ms + 1000 * this.blockAge; }
+
+  // Of the state of the bench, which its process also sends without new data.
+  get stateAge_ms() { return this.silent_ms + 1000 * this.stateAge; }
 
   get silent_ms() { return performance.now() - this.framedAt; }
 
@@ -47,7 +51,7 @@ export class Link extends Requests {
     };
     socket.onclose = ({ code, reason }) => {
       if (socket !== this.socket) return;
-      this.problem = code === 1008 ? `The server refused this page (${reason || "wrong address"}). Open the address that haselab panel printed.` : "";
+      if (code === 1008) this.problem = `The server refused this page (${reason || "wrong address"}). Open the address that haselab panel printed.`;
       this.socket = null;
       this.lost();
       this.onChange();
@@ -87,7 +91,11 @@ export class Link extends Requests {
 
   framed(buffer) {
     const head = new DataView(buffer);
-    if (head.getUint16(0, true) !== SCHEMA) { location.reload(); return; }
+    if (head.getUint16(0, true) !== SCHEMA) { // no reload of its own: it would lose what is not saved
+      this.problem = "This page belongs to another version of the panel. Reload it.";
+      this.socket.close();
+      return;
+    }
     const number = head.getUint32(4, true);
     const [monitorStart, monitorStep, signalStart, signalStep] = [8, 16, 24, 32].map((at) => head.getFloat64(at, true));
     const size = head.getUint32(40, true), columns = head.getUint32(44, true);
@@ -108,6 +116,7 @@ export class Link extends Requests {
     this.framedAt = performance.now();
     this.patience = SILENT_MS;
     this.blockAge = about.age_s;
+    this.stateAge = about.state_age_s;
     this.clock = about.clock_s;
     this.send({ ack: number });
     this.onFrame({ ...about, monitors, signals });

@@ -6,6 +6,13 @@ const BEGUN = /^\s*[+-]?(\d*\.?\d*|(\d+\.?\d*|\.\d+)e[+-]?\d*)\s*$/i; // of a nu
 const COMMA = /^[+-]?\d*,\d+(e[+-]?\d+)?$/i;
 let fields = 0;
 
+// The distance of the steps of a slider, a power of ten, and its ends on whole steps within the limits.
+export function stepsOf(low, high, few = 20) {
+  const power = Math.floor(Math.log10(Math.max((high - low) / few, 1e-9)) + 1e-9), step = 10 ** power;
+  const round = (count) => Number((count * step).toFixed(Math.max(-power, 0)));
+  return { step: round(1), min: round(Math.ceil(low / step - 1e-6)), max: round(Math.floor(high / step + 1e-6)) };
+}
+
 const HANDLE_PX = 28; // from the middle of a handle: a finger is on it
 
 // A slider that a finger moves only by its handle: a swipe that scrolls the page may begin anywhere on it.
@@ -40,15 +47,16 @@ export function numberOf(text, { low = -Infinity, high = Infinity, above = -Infi
 // A field that shows the text `shown` while nobody types: the attributes of its input, the line about a
 // wrong number, and `read`, which returns the number, or null with this line. `enter` gets what was typed.
 // `leave`: what happens when the focus leaves the field. `input`: it gets each text. Arrow keys change the
-// number by `step` from `least` to `most`; `stepped` gets it.
-export function useNumber(shown, { rule = {}, step = 1, least = rule.low ?? -Infinity, most = rule.high ?? Infinity, enter, leave, input, stepped } = {}) {
+// number by `step` from `least` to `most`; `stepped` gets it. `refused`: why the bench refused the last number; the
+// field calls `begun` when another one is typed.
+export function useNumber(shown, { rule = {}, step = 1, least = rule.low ?? -Infinity, most = rule.high ?? Infinity, enter, leave, input, stepped, refused = "", begun } = {}) {
   const [typed, type] = useState(null);
   const [asked, ask] = useState(false); // whether somebody wanted the number
   const id = useRef("");
   if (id.current === "") id.current = `number-${++fields}`;
   const text = typed ?? shown, found = numberOf(text, rule);
-  const problem = asked || !BEGUN.test(text) ? found.problem : "";
-  const put = (next) => { ask(false); if (input) input(next); else type(next); };
+  const problem = (asked || !BEGUN.test(text) ? found.problem : "") || refused;
+  const put = (next) => { ask(false); begun?.(); if (input) input(next); else type(next); };
   const reset = () => { ask(false); type(null); };
   const read = () => { ask(found.value === null); return found.value; };
   function commit() {
@@ -71,7 +79,7 @@ export function useNumber(shown, { rule = {}, step = 1, least = rule.low ?? -Inf
     text, read,
     field: {
       type: "text", inputmode: "decimal", autocomplete: "off", value: text, "aria-invalid": problem ? "true" : null, "aria-describedby": problem ? id.current : null,
-      onInput: (event) => put(event.target.value), onKeyDown: key, onBlur: leave === "commit" ? commit : leave === "reset" ? reset : undefined,
+      onInput: (event) => put(event.target.value), onKeyDown: key, onBlur: { commit, reset, check: () => text.trim() !== "" && read() }[leave],
     },
     line: problem && html`<p class="error number" role="alert" id=${id.current}>${problem}</p>`,
   };

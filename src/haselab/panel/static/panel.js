@@ -1,10 +1,12 @@
-import { html, render, useState, useEffect, useReducer } from "/static/vendor/htm-preact.js";
+import { html, render, useState, useEffect, useReducer, useRef } from "/static/vendor/htm-preact.js";
 import { Charts } from "/static/charts.js";
 import { Link } from "/static/link.js";
-import { Arming, Playing, Progress, Said, kilo, limitOf } from "/static/bench.js";
-import { Range, useNumber } from "/static/number.js";
+import { Arming, Playing, Progress, Said, focusLost, kilo, limitOf, othersDo } from "/static/bench.js";
+import { Range, stepsOf, useNumber } from "/static/number.js";
+import { unsaved } from "/static/requests.js";
 
 const STALE_MS = 450;
+const ANSWERED_MS = 350; // since the last state of a twin that computes; looked at every 100 ms
 const LOST_MS = 1500; // without data: what is shown of the bench is old, and commands are useless
 const MOST_PAUSE_MS = 1000; // between two draws
 let frame = null;
@@ -18,8 +20,7 @@ const link = new Link((found) => {
 }, () => redraw());
 
 window.stopBesides = () => link.ask("stop");
-const leaving = { asks: false }; // while this page has armed the bench
-addEventListener("beforeunload", (event) => { if (leaving.asks) event.preventDefault(); });
+addEventListener("beforeunload", (event) => { if (unsaved.size > 0) event.preventDefault(); });
 
 // Pauses three times as long as a draw took, but for 1 s at most, so that a slow computer is free for STOP.
 async function drawNewest() {
@@ -58,39 +59,53 @@ function zoom({ from, to, key, event }) {
   if (event) event.preventDefault();
 }
 
-function Slider({ name, unit, low, high, step, value, send, about }) {
+// A value that the bench refused is named at its field, until another command or the next key.
+function Slider({ name, unit, low, high, value, send, about, refused, begun }) {
   const [sent, setSent] = useState(null); // until the bench has it
   useEffect(() => setSent(null), [value]);
   const put = (number) => { setSent(String(number)); send(number).then((found) => { if (found.error || found.answer?.note) setSent(null); }); };
   const now = sent ?? String(Number(value.toPrecision(6)));
-  const typed = useNumber(now, { least: low, most: high, enter: put, leave: "reset" });
-  return html`<label>${name}, in ${unit}${about ? `: ${about}` : ""}
-    <${Range} min=${low} max=${high} step=${step} value=${now} put=${put} /></label>
-    <label>${name}, typed, in ${unit} (press Enter)
+  const typed = useNumber(now, { least: low, most: high, enter: put, leave: "reset", refused, begun });
+  const ends = [low, high].map((v) => Number(v.toPrecision(6)));
+  return html`<label>${name}, in ${unit}, ${ends[0]} to ${ends[1]}${about ? `: ${about}` : ""}
+    <${Range} ...${stepsOf(low, high)} value=${now} put=${put} /></label>
+    <label>${name}, typed, in ${unit}, ${ends[0]} to ${ends[1]} (press Enter)
     <input ...${typed.field} /></label>${typed.line}`;
 }
 
 function Live({ state, say }) {
   const [note, setNote] = useState(""); // about the last command
-  const ask = (what, values) => link.ask(what, values).then((found) => { say(found.error || ""); setNote(found.answer?.note ?? ""); return found; });
+  const [refused, refuse] = useState({}); // by the command: why the bench refused its last value
+  const ask = (what, values) => link.ask(what, values).then((found) => {
+    say(found.limit ? "" : found.error || "");
+    refuse(found.limit ? { [what]: found.error } : {});
+    setNote(found.answer?.note ?? "");
+    return found;
+  });
+  const at = (what) => ({ refused: refused[what] ?? "", begun: () => { refuse({}); say(""); } });
+  const place = useRef(null);
+  const isLooped = state.mode === "loop";
+  useEffect(() => { // after Arm, and after Open the loop; in the field, a key that is still down does nothing
+    if (state.mode !== "study" && focusLost()) place.current?.querySelector("input[inputmode]").focus();
+  }, [isLooped]);
   const low = Math.max(state.low_v, -state.limit_v);
   if (state.mode === "study") return html`<${Playing} state=${state} link=${link} say=${say} />`;
-  return html`
+  return html`<div ref=${place}>
     ${note && html`<p role="status">${note}</p>`}
     <p class="badge live">Armed by this page up to ${limitOf(state)}</p>
     <p>The sensing signal is on, also while the drive is 0 V. Driving by hand is not recorded.</p>
-    <${Slider} name="Drive" unit="V" low=${low} high=${state.limit_v} step="0.01" value=${state.target_v}
+    <${Slider} name="Drive" unit="V" low=${low} high=${state.limit_v} value=${state.target_v} ...${at("drive")}
       about=${`now ${kilo(state.drive_v, state.gain)}, ${state.mode === "loop" ? "set by the controller" : `changes by 1 V/s (${Number((state.gain / 1000).toPrecision(3))} kV/s at the output)`}`} send=${(v) => ask("drive", { value_v: v })} />
     ${state.loop === null
       ? html`<p>The loop cannot be closed: there is no actuator file with both maps and a controller. Start the panel with <code>--actuator FILE</code>. A study with <code>[triangle]</code>, <code>[chirp]</code> and <code>[steps]</code> writes one, actuator.toml, into the folder of its recording. For one from example records, run <code>haselab example actuator --out example</code> and follow its README.md.</p>`
-      : html`<${Slider} name="Desired strain" unit="%" low=${100 * state.loop[0]} high=${100 * state.loop[1]} step="0.1"
+      : html`<${Slider} name="Desired strain" unit="%" low=${100 * state.loop[0]} high=${100 * state.loop[1]} ...${at("loop")}
           value=${100 * (state.reference ?? 0)} about=${state.mode === "loop" ? "closed loop" : "the loop is open; moving this slider closes it, and the drive jumps to what the controller puts out"}
           send=${(v) => ask("loop", { strain: v / 100 })} />`}
     <div class="row">
       <button type="button" onClick=${() => ask("drive", { value_v: 0 })}>Ramp to 0 V</button>
       ${state.mode === "loop" && html`<button type="button" onClick=${() => ask("open")}>Open the loop</button>`}
       <button type="button" onClick=${() => ask("disarm").then(() => scrollTo(0, 0))}>Disarm</button>
-    </div>`;
+    </div></div>`;
 }
 
 function Camera({ filming }) {
@@ -154,19 +169,24 @@ function Panel() {
       if (columns !== link.view.columns) link.setView({ columns });
     });
   }, []);
-  const stale = link.age_ms > STALE_MS, lost = link.age_ms > LOST_MS;
   const state = frame?.state?.stage ? frame.state : null;
+  // A twin that computes still sends its state, and says so; the bench is silent if this state is old, too.
+  const computing = link.age_ms > STALE_MS && Boolean(state?.computing) && link.stateAge_ms < ANSWERED_MS;
+  const stale = link.age_ms > STALE_MS && !computing, lost = link.age_ms > LOST_MS && !computing;
   const seconds = link.age_ms / 1000;
-  const age = Number.isFinite(seconds) ? `NO NEW DATA for ${seconds.toFixed(1)} s` : "NO DATA YET";
+  const age = !Number.isFinite(seconds) ? "NO DATA YET" : computing ? `The simulated bench is computing: no new data for ${seconds.toFixed(1)} s` : `NO NEW DATA for ${seconds.toFixed(1)} s`;
   const live = state !== null && state.holder !== "";
   const mine = live && state.holder === link.holder;
   const tripped = state?.stage === "tripped";
   useEffect(() => { if (tripped) say(""); }, [tripped]); // the reason of the trip is shown instead
+  const others = othersDo(state, link);
+  useEffect(() => { if (others) say(""); }, [others]);
+  useEffect(() => { if (!mine && focusLost()) document.querySelector(".layout .arm")?.focus({ preventScroll: true }); }, [mine]); // after Disarm
   const paused = link.view.end_s !== null;
   document.body.classList.toggle("stale", stale);
-  document.body.classList.toggle("paused", paused);
+  document.body.classList.toggle("paused", paused || computing);
   document.body.classList.toggle("lost", lost);
-  leaving.asks = mine && !lost;
+  if (mine && !lost) unsaved.add("armed"); else unsaved.delete("armed");
   const stage = state ? `${STAGES[state.stage] ?? state.stage}${live ? `, ${kilo(state.drive_v, state.gain)}` : ""}` : "";
   const bench = state === null ? "Bench: unknown" : stale ? `Bench: unknown (last: ${stage})` : `Bench: ${stage}`;
   const corner = document.getElementById("corner-state"), said = stale ? `${age}. ${bench}` : bench;
@@ -179,7 +199,7 @@ function Panel() {
       <h1>${state ? state.name : "haselab panel"}</h1>
       ${state?.simulated && html`<span class="badge">SIMULATED</span>`}
       <span class=${`badge ${live ? "live" : ""} ${stale || tripped ? "bad" : ""}`} role="status">${bench}</span>
-      <span id="age" class=${`badge ${stale ? "bad" : paused ? "live" : ""}`} role="status">${stale ? age : paused ? `VIEW PAUSED at ${link.view.end_s.toFixed(1)} s` : "data live"}</span>
+      <span id="age" class=${`badge ${stale ? "bad" : paused || computing ? "live" : ""}`} role="status">${stale || computing ? age : paused ? `VIEW PAUSED at ${link.view.end_s.toFixed(1)} s` : "data live"}</span>
     </header>
     <nav class="row" aria-label="Pages">
       ${Object.keys(TABS).map((name) => html`<button type="button" aria-current=${name === tab ? "page" : "false"} onClick=${() => open(name)}>${name}</button>`)}

@@ -206,6 +206,7 @@ function Picker({ link, isArmed }) {
   const [chosen, choose] = useState(null);
   const [count, setCount] = useState("300");
   const [table, setTable] = useState("");
+  const [noName, setNoName] = useState(false); // Save was pressed without a file name
   const [moveAside, setMoveAside] = useState(false);
   const [scale, setScale] = useState("");
   const [scaleError, setScaleError] = useState(""); // also of the answer to Save; shown once
@@ -215,6 +216,7 @@ function Picker({ link, isArmed }) {
   const searches = useRef(0);
   const wanted = useRef(null);
   const frame = useRef(null);
+  const nameField = useRef(null);
   const card = useRef(null), note = useRef(null);
   const work = useWork();
   const view = useView(picture, frame);
@@ -238,7 +240,7 @@ function Picker({ link, isArmed }) {
     if (name !== kept.video) work.clear();
     kept.video = name;
     say({ text: "", bad: false });
-    setVideo(name); setTable(""); setDone(null); setPicture(null); choose(null); view.whole();
+    setVideo(name); setTable(""); setNoName(false); setDone(null); setPicture(null); choose(null); view.whole();
     if (name) show(name, 0);
   }
   async function look() {
@@ -268,8 +270,8 @@ function Picker({ link, isArmed }) {
 
   const ends = work.marks.filter((one) => one.kind === "ruler");
   const lengthRule = { above: 0 }, distance = numberOf(work.length, lengthRule).value;
-  const typedLength = useNumber(work.length, { rule: lengthRule, least: 0, input: (length) => work.change((old) => ({ ...old, length })) });
-  const typedCount = useNumber(count, { rule: { low: 1, high: 5000, whole: true }, input: setCount });
+  const typedLength = useNumber(work.length, { rule: lengthRule, least: 0, leave: "check", input: (length) => work.change((old) => ({ ...old, length })) });
+  const typedCount = useNumber(count, { rule: { low: 1, high: 5000, whole: true }, leave: "check", input: setCount });
   const ruler = ends.length === 2 && distance !== null ? [ends[0].x, ends[0].y, ends[1].x, ends[1].y, distance] : null;
   useEffect(() => {
     setScaleError("");
@@ -347,6 +349,9 @@ function Picker({ link, isArmed }) {
   }
   async function save() {
     if (work.length.trim() !== "" && typedLength.read() === null) { fail({ error: "Not saved, because the distance in Scale is not valid." }); return; }
+    const isNameless = !list.only && table.trim() === "";
+    setNoName(isNameless);
+    if (isNameless) { nameField.current?.focus(); return; }
     const points = work.marks.filter((one) => one.kind === "point").map((one) => [one.name, one.x, one.y]);
     const found = await link.request("pick-save", { video, points, ruler, table: list.only ? "" : table, move: moveAside });
     if (found.error) { fail(found); return; }
@@ -367,7 +372,8 @@ function Picker({ link, isArmed }) {
   return html`
     ${!list.only && html`<label>Video <select value=${video} disabled=${isArmed} onChange=${(e) => open(e.target.value)}>
       <option value="">Choose one of ${list.more ? "the first " : ""}${list.videos.length} below ${list.folder}</option>
-      ${list.videos.map((name) => html`<option value=${name}>${name}</option>`)}</select></label>`}
+      ${list.videos.map((name) => html`<option value=${name}>${name}</option>`)}</select></label>
+      ${isArmed && html`<p role="status">The bench is armed, so the list of videos cannot be opened: it would take the key of STOP. Disarm the bench first.</p>`}`}
     ${!list.only && !list.videos.length && html`<p>There is no video below ${list.folder}. Start haselab panel with --runs DIR, or use haselab track --pick VIDEO.</p>`}
     ${picture === null ? message : html`<div class="layout pick">
       <section aria-label="Picture">
@@ -402,7 +408,8 @@ function Picker({ link, isArmed }) {
           <label>At most this many <input ...${typedCount.field} /></label>${typedCount.line}
           <button type="button" disabled=${pair("region").length < 2} onClick=${find}>Find the dots in the region</button></div>
         <div class="card"><h2>Save</h2>
-          ${list.only ? html`<p><code>${table}</code></p>` : html`<label>File name of the table <input type="text" value=${table} onInput=${(e) => setTable(e.target.value)} /></label>`}
+          ${list.only ? html`<p><code>${table}</code></p>` : html`<label>File name of the table <input type="text" value=${table} ref=${nameField} aria-invalid=${noName ? "true" : null} aria-describedby=${noName ? "no-name" : null} onInput=${(e) => { setTable(e.target.value); setNoName(false); }} /></label>
+            ${noName && html`<p class="error number" role="alert" id="no-name">Not saved: this field is empty. Type a file name, such as points.csv.</p>`}`}
           <label><input type="checkbox" checked=${moveAside} onChange=${(e) => setMoveAside(e.target.checked)} /> Move an existing file to NAME.previous-1</label>
           <button type="button" disabled=${!points.length || pending > 0} onClick=${save}>Save ${points.length} points</button></div>
         ${saved}

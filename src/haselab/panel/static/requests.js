@@ -1,4 +1,6 @@
 // The token of this page, and answers by HTTP.
+export const unsaved = new Set(); // why leaving or reloading the page asks first: what would be lost
+
 export class Requests {
   constructor() {
     this.token = new URLSearchParams(location.search).get("token") || sessionStorage.getItem("token") || "";

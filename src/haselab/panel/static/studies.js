@@ -1,11 +1,11 @@
 // Choose, check and play a study; the list of recordings.
 import { html, useState, useEffect, useMemo, useRef } from "/static/vendor/htm-preact.js";
-import { Arming, Playing, Progress, Said, fixed, kilo, limitOf } from "/static/bench.js";
+import { Arming, Playing, Progress, Said, fixed, focusLost, kilo, limitOf, othersDo } from "/static/bench.js";
 
 const number = (v) => (v === null || v === undefined ? "" : Number(v.toPrecision(5)));
 const clock = new Intl.DateTimeFormat("sv-SE", { dateStyle: "short", timeStyle: "medium" }); // as in the names of the folders
 const local = (time) => (Number.isNaN(Date.parse(time)) ? "" : clock.format(new Date(time)));
-const when = (s) => (s === null ? "unknown" : s < 120 ? `${Math.round(s)} s` : `${Math.round(s / 60)} min`);
+const when = (s) => (s === null ? "an unknown time" : s < 120 ? `${Math.round(s)} s` : `${Math.round(s / 60)} min`);
 
 let remembered = null; // the choice, while another page of the panel is shown
 
@@ -33,32 +33,48 @@ function Chooser({ link, state, mine, onEnd }) {
     setChecked(found.error ? null : found);
     say(found.error || "");
   }
-  const busy = state !== null && state.holder !== "";
+  const busy = state !== null && state.holder !== "", others = othersDo(state, link);
+  useEffect(() => { if (others) say(""); }, [others]);
+  const place = useRef(null), isPlaying = busy && state.mode === "study", played = useRef(false);
+  useEffect(() => { // at its end
+    if (played.current && !isPlaying && focusLost()) place.current?.focus({ preventScroll: true });
+    played.current = isPlaying;
+  }, [isPlaying]);
+  const disarm = () => link.ask("disarm").then((found) => { say(found.error || ""); place.current?.focus(); });
   if (busy && state.mode === "study" && mine) return html`<div class="card warning"><h2>Study</h2>
     <${Said} error=${error} /><${Playing} state=${state} link=${link} say=${say} /></div>`;
   if (busy && state.mode === "study") return html`<div class="card warning"><h2>Study</h2>
     <p class="badge live">Another page plays a study, up to ${limitOf(state)}</p><${Progress} state=${state} /></div>`;
   if (list === null) return html`<div class="card"><h2>Study</h2><p class=${error ? "error" : ""} role="status">${error || "Reading the studies …"}</p></div>`;
+  const blocked = busy && html`<div class="row" role="status"><span>${mine ? "This page has armed the bench. Disarm it before you play a study." : "The bench is armed by another page. Disarm it there before you play a study."} The list of studies cannot be opened meanwhile: it would take the key of STOP.</span>${mine && html`<button type="button" onClick=${disarm}>Disarm</button>`}</div>`;
   const titles = list.find((one) => one.name === chosen.study)?.experiments ?? [];
   const toggle = (table, on) => change({ experiments: titles.map((one) => one.table).filter((one) => (one === table ? on : chosen.experiments.includes(one))) });
+  // Planned on the clock of the bench; a file that cannot be planned has none.
+  const seconds = titles.filter((one) => chosen.experiments.includes(one.table)).map((one) => one.seconds[Number(chosen.quick)] ?? null);
+  const total = seconds.includes(null) ? null : seconds.reduce((sum, one) => sum + one, 0);
+  const fast = state?.simulated ? " This simulated bench plays it as fast as this computer can." : "";
   return html`<div class="card"><h2>Study</h2>
     <${Said} error=${error} />
+    ${blocked}
     ${state?.reason && html`<p role="status">Last message of the bench: ${state.reason}</p>`}
     <label>Study <select value=${chosen.study} disabled=${busy} onChange=${(e) => pick(list, e.target.value)}>
       ${list.map((one) => html`<option value=${one.name}>${one.name}</option>`)}</select></label>
     <fieldset><legend>Experiments</legend>
+      <div class="row"><button type="button" onClick=${() => change({ experiments: titles.map((one) => one.table) })}>All</button>
+        <button type="button" onClick=${() => change({ experiments: [] })}>None</button></div>
       ${titles.map((one) => html`<label><input type="checkbox" checked=${chosen.experiments.includes(one.table)}
-        onChange=${(e) => toggle(one.table, e.target.checked)} /> ${one.title} (${one.table})</label>`)}</fieldset>
+        onChange=${(e) => toggle(one.table, e.target.checked)} /> ${one.title} (${one.table})${typeof one.seconds[Number(chosen.quick)] === "number" ? `: ${when(one.seconds[Number(chosen.quick)])}` : ""}</label>`)}</fieldset>
     <label><input type="checkbox" checked=${chosen.quick} onChange=${(e) => change({ quick: e.target.checked })} /> Short version</label>
     <label><input type="checkbox" checked=${chosen.keep_video === "none"} onChange=${(e) => change({ keep_video: e.target.checked ? "none" : "sample" })} /> Keep no camera frames</label>
-    <div class="row"><button type="button" disabled=${checked === "checking" || chosen.experiments.length === 0} onClick=${check}>Check, then play …</button>
+    ${seconds.length > 0 && total !== null && html`<p>Together about ${when(total)} of bench time.${fast}</p>`}
+    <div class="row"><button type="button" ref=${place} disabled=${checked === "checking" || chosen.experiments.length === 0} onClick=${check}>Check, then play …</button>
       ${chosen.experiments.length === 0 && html`<span>Tick an experiment first.</span>`}</div>
     ${checked === "checking" && html`<p role="status">Checking the study against the limits of the bench …</p>`}
     ${checked !== null && checked !== "checking" && html`
       <p role="status">${!checked.rated ? "The rating of this bench is not known (the rig file has no [rating]), so the study was not checked against it."
-        : checked.ok ? `The bench can play this study. It takes ${when(checked.seconds)} on a real bench${state?.simulated ? ", and a fraction of this time on this simulated one" : ""}. Its highest drive is ${kilo(checked.highest_v, state?.gain ?? 1)}.` : "The bench cannot play this study."}</p>
-      ${checked.ok && (busy ? html`<p>${mine ? "The bench is armed. Disarm it on the page Live before you play a study." : "The bench is armed by another page. Disarm it there before you play a study."}</p>`
-        : state && html`<${Arming} state=${state} link=${link} say=${say} study=${{ ...chosen, sha256: checked.sha256 }} onArmed=${() => setChecked(null)} />`)}
+        : checked.ok ? `The bench can play this study. It takes ${when(checked.seconds)} of bench time. Its highest drive is ${kilo(checked.highest_v, state?.gain ?? 1)}.` : "The bench cannot play this study."}</p>
+      ${checked.ok && busy && html`<p>The bench is armed: disarm it first, see above.</p>`}
+      ${checked.ok && !busy && state && html`<${Arming} state=${state} link=${link} say=${say} study=${{ ...chosen, sha256: checked.sha256 }} needs=${checked.highest_v ?? 0} onArmed=${() => setChecked(null)} />`}
       ${checked.checks.length > 0 && html`<table class="wide"><thead><tr><th scope="col">Check</th><th scope="col">Where</th><th scope="col">Needed</th><th scope="col">Limit</th><th scope="col">What to do</th></tr></thead>
         <tbody>${checked.checks.map((one) => html`<tr><td data-label="Check">${one.name}</td><td data-label="Where">${one.where}</td><td data-label="Needed" class=${one.ok ? "" : "error"}>${number(one.requested)} ${one.unit}</td>
           <td data-label="Limit">${number(one.limit)} ${one.unit}</td><td data-label="What to do">${one.ok ? "nothing" : one.advice}</td></tr>`)}</tbody></table>`}`}
@@ -115,13 +131,28 @@ function Report({ name, text, close }) {
   const place = useRef(null);
   const [lost, lose] = useState(false);
   const address = useMemo(() => URL.createObjectURL(new Blob([text], { type: "text/html" })), []);
-  useEffect(() => { place.current.scrollIntoView(); place.current.focus({ preventScroll: true }); return () => URL.revokeObjectURL(address); }, []);
+  useEffect(() => {
+    const before = document.activeElement;
+    place.current.scrollIntoView();
+    place.current.focus({ preventScroll: true });
+    return () => { URL.revokeObjectURL(address); before?.focus(); }; // on the button that has opened it
+  }, []);
   // Esc must press STOP also while the focus is in the report: nothing else may take the keys there.
   function loaded({ target }) {
     const found = target.contentDocument;
     if (!found?.URL.startsWith(address)) { lose(true); place.current.focus(); return; }
     found.querySelectorAll("iframe, frame, object, embed, select, input, textarea").forEach((one) => one.remove());
     window.listenForStop(found);
+    // A browser would also scroll this page to the place of a link in the report.
+    found.addEventListener("click", (event) => {
+      const aim = event.target.closest?.("a[href^='#']"), to = aim && found.getElementById(decodeURIComponent(aim.hash.slice(1)));
+      if (!aim) return;
+      event.preventDefault();
+      if (!to) return;
+      found.defaultView.scrollTo(0, found.defaultView.scrollY + to.getBoundingClientRect().top);
+      to.tabIndex = -1;
+      to.focus({ preventScroll: true });
+    });
   }
   return html`<div class="card report"><h2 ref=${place} tabindex="-1">Report of ${name}</h2>
     <div class="row"><button type="button" onClick=${close}>Close the report</button>
@@ -181,9 +212,12 @@ function Recordings({ link, mode, recording }) {
       <td data-label="Mark"><input type="checkbox" aria-label=${`Mark ${one.name}`} checked=${marked.includes(one.name)} onChange=${(e) => toggle(one.name, e.target.checked)} /></td>
       <td data-label="Recording">${one.name}<br /><small>${local(one.opened)}</small></td><td data-label="Study">${one.study}</td><td data-label="Ended">${one.name === recording ? "being recorded" : one.state}</td>
       <td data-label="Note"><${Note} name=${one.name} saved=${one.note} keep=${keep} /></td>
-      <td data-label="Results">${one.report ? html`<button type="button" onClick=${() => open(one.name)}>Report</button>` : ""}
-        <button type="button" disabled=${one.analysing || one.open} onClick=${() => analyse(one.name)}>${one.analysing ? "Analysing …" : "Analyse"}</button>
+      <td data-label="Results"><div class="row">${one.report ? html`<button type="button" onClick=${() => open(one.name)}>Report</button>` : ""}
+        <button type="button" disabled=${one.analysing || one.open} onClick=${() => analyse(one.name)}>${one.analysing ? "Analysing …" : "Analyse"}</button></div>
+        ${one.open && one.name !== recording && html`<p>It can be analysed after haselab recover.</p>`}
+        ${one.state && !one.open && !one.report && !one.problem && !/^(complete|recovered)/.test(one.state) && html`<p>It ended early. The analysis needs complete experiments, so it is refused if one was cut short.</p>`}
         ${one.problem && html`<p class="error">${one.problem}</p>`}</td></tr>`)}</tbody></table>
+    ${all.length === 0 && wanted.length > 0 && html`<p role="status">No recording contains “${search.trim()}” in its name, study, date, end or note.</p>`}
     ${all.length > most && html`<p>The newest ${most} of ${all.length} are shown.</p><button type="button" onClick=${() => setMost(most + MOST_ROWS)}>Show more</button>`}</div>`;
 }
 

@@ -152,6 +152,22 @@ def run(*words: object) -> dict[str, Any]:
     return json.loads(done.stdout)
 
 
+def test_points_that_are_not_saved_are_not_lost_without_a_question(picking: Picking) -> None:
+    asked: list[str] = []
+    picking.page.on("dialog", lambda dialog: (asked.append(dialog.type), dialog.dismiss()))
+    picking.click(*UPPER[1])
+    picking.page.evaluate("() => { setTimeout(() => location.reload()); }")
+    picking.page.wait_for_timeout(500)
+    assert asked == ["beforeunload"] and len(picking.marks()) == 1
+    picking.page.get_by_role("button", name="Undo").click()  # nothing would be lost
+    picking.page.reload()
+    assert asked == ["beforeunload"]
+    expect(picking.page.get_by_role("application")).to_be_visible(timeout=WAIT_MS)
+    picking.click(*UPPER[1])
+    picking.save()
+    assert asked == ["beforeunload"]
+
+
 def test_picked_points_are_those_that_track_finds_and_give_its_strain(
     picking: Picking, video: Path, tmp_path: Path
 ) -> None:

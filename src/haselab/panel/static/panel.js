@@ -20,7 +20,6 @@ const link = new Link((found) => {
 }, () => redraw());
 
 window.stopBesides = () => link.ask("stop");
-addEventListener("beforeunload", (event) => { if (unsaved.size > 0) event.preventDefault(); });
 
 // Pauses three times as long as a draw took, but for 1 s at most, so that a slow computer is free for STOP.
 async function drawNewest() {

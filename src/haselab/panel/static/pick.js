@@ -1,6 +1,7 @@
 // Points, a ruler and a region on a frame of a video, for haselab track.
 import { html, useState, useEffect, useLayoutEffect, useMemo, useRef } from "/static/vendor/htm-preact.js";
 import { numberOf, useNumber } from "/static/number.js";
+import { unsaved } from "/static/requests.js";
 
 const REACH = { mouse: 12, touch: 24, pen: 16 }; // to a mark, in px of the screen
 const SNAP = 24; // to a dot, in px of the screen
@@ -47,11 +48,16 @@ function useView(picture, frame) {
   };
 }
 
+function noteUnsaved() {
+  const { marks } = kept.work.now;
+  if (marks.length > 0 && marks !== kept.saved) unsaved.add("points"); else unsaved.delete("points");
+}
+
 // What was picked, with undo and redo. `change(make, join)`: with join, it is one step with the last change.
 function useWork() {
   const [work, setWork] = useState(kept.work);
   const latest = useRef(work);
-  const put = (next) => { latest.current = kept.work = next; setWork(next); };
+  const put = (next) => { latest.current = kept.work = next; setWork(next); noteUnsaved(); };
   return {
     ...work.now, canUndo: work.past.length > 0, canRedo: work.future.length > 0,
     latest: () => latest.current.now,
@@ -357,6 +363,8 @@ function Picker({ link, isArmed }) {
     if (found.error) { fail(found); return; }
     say({ text: "", bad: false });
     setDone({ ...found, marks: work.marks, scale }); setMoveAside(false);
+    kept.saved = work.marks;
+    noteUnsaved();
   }
 
   if (list === null) return html`<p role=${said.bad ? "alert" : "status"} class=${said.bad ? "error" : ""}>${said.text || "Looking for videos …"}</p>`;

@@ -1,5 +1,6 @@
 // The token of this page, and answers by HTTP.
 export const unsaved = new Set(); // why leaving or reloading the page asks first: what would be lost
+addEventListener("beforeunload", (event) => { if (unsaved.size > 0) event.preventDefault(); });
 
 export class Requests {
   constructor() {

@@ -254,24 +254,20 @@ class PeanoHasel(ActuatorLaw):
         known = near.solution if near else None
         if not isinstance(known, np.ndarray) or known.shape != (every_v.size, length.size):
             known = None
-        rows = 1 + count
-        found = self._state(length, every_v[:rows, None], None if known is None else known[:rows])
+        found = self._state(length, every_v[:, None], known)
         at_rest_n = found.tension_n[0]
-        pull_n_v2 = (at_rest_n - found.tension_n[1:]) / acting_v[:, None] ** 2
-        y = found.y
+        pull_n_v2 = (at_rest_n - found.tension_n[1 : 1 + count]) / acting_v[:, None] ** 2
         if small.any():  # see `electric_force_n`
-            within = self._state(
-                length, every_v[rows:, None], None if known is None else known[rows:], slopes=True
-            )
-            slopes = within.tension_per_pull.reshape(-1, _NODES.size, length.size)
+            slopes = found.tension_per_pull[1 + count :].reshape(-1, _NODES.size, length.size)
             mean = 0.5 * np.einsum("vnl,n->vl", slopes, _WEIGHTS)
             pull_n_v2[small] = -0.5 * self.zipped_f_per_m * mean
-            y = np.concatenate([y, within.y])
-        zipped_m = np.where(voltages_v[:, None] < 1.0, found.zipped_m[:1], found.zipped_m[1:])
+        zipped_m = np.where(
+            voltages_v[:, None] < 1.0, found.zipped_m[:1], found.zipped_m[1 : 1 + count]
+        )
         return LawValues(
             self, lengths_m, at_rest_n + self.restoring_n_per_m * (length - self.pouch.rest_m),
             self.pouches * (self._unzipped_f + self.zipped_f_per_m * zipped_m),
-            pull_n_v2, y,
+            pull_n_v2, found.y,
         )  # fmt: skip
 
     def elastic_energy_j(self, length_m: ArrayLike) -> Floats:
@@ -366,25 +362,17 @@ class PeanoHasel(ActuatorLaw):
         zipping_j = self._pull_n(voltage) * state.zipped_m
         return np.asarray(film_j + resisted_j - rounded_j - zipping_j)
 
-    def _state(
-        self,
-        length: Floats,
-        voltage_v: ArrayLike,
-        near: Floats | None = None,
-        *,
-        slopes: bool = False,
-    ) -> _State:
+    def _state(self, length: Floats, voltage_v: ArrayLike, near: Floats | None = None) -> _State:
         r"""Solve the balance of zipping, $T\,ds/dz = \tfrac12\kappa V^2 + \theta/z - U'$.
 
         In $y = \ln(ds/dz)$ the tension is explicit, and so is the length, which falls with y.
-        The solution of a similar law is near enough for one step of Newton, and for two if
-        `tension_per_pull` is wanted, which does not follow that step.
+        The solution of a similar law is near enough for two steps of Newton.
         """
         length, pull_n = np.broadcast_arrays(length, self._pull_n(voltage_v))
         wanted_m, pulls_n = length.ravel(), pull_n.ravel()
         with np.errstate(all="ignore"):  # outside the bracket some terms are infinite
             y = self._solved(wanted_m, pulls_n) if near is None else near.ravel()
-            if near is not None and slopes:
+            if near is not None:
                 y = y + self._left(y, self._balance(y, pulls_n), wanted_m)
             found = self._balance(y, pulls_n)
             left = 0.0 if near is None else self._left(y, found, wanted_m)

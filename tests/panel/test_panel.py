@@ -27,7 +27,7 @@ def test_a_page_arms_the_bench_and_drives_it_within_the_typed_limit(panel: Runni
     async def play() -> None:
         async with connected(panel) as page:
             assert "error" in await page.ask("drive", value_v=1.0)  # not armed
-            assert "it must be 0.001 to 2 V" in (await page.arm(2.5))["error"]
+            assert "it must be at least 0.001 V and at most 2 V" in (await page.arm(2.5))["error"]
             assert "error" not in await page.arm(1.5)
             refused = await page.ask("drive", value_v=1.6)
             assert refused["error"].startswith("The requested drive is 1.6 V, but the bench was")

@@ -21,7 +21,7 @@ _NEWTON = 60
 
 
 class Arcs(NamedTuple):
-    """A pouch at some half angles of its arcs."""
+    """Zipped length (m), stroke (m) and zipped length per half angle (m/rad) of a pouch."""
 
     zipped_m: Floats
     stroke_m: Floats
@@ -94,8 +94,8 @@ class Pouch:
 
         Args:
             angle_rad: half angle of the arcs. Shape `(...)`.
-            sine: of it. Shape `(...)`.
-            cosine: of it. Shape `(...)`.
+            sine: of the angle. Shape `(...)`.
+            cosine: of the angle. Shape `(...)`.
         Returns:
             The same as `zipped_m`, `stroke_m` and `zipped_per_rad`.
         """

@@ -231,7 +231,7 @@ def is_real(value: object) -> TypeGuard[float]:
 
 
 def check_length(name: str, value: object) -> None:
-    """Refuse what is neither None nor a length.
+    """Refuse a value that is neither None nor a finite length above 0.
 
     Args:
         name: of the argument.

@@ -17,7 +17,7 @@ __all__ = ["CHECK", "ArmedStudy"]
 
 CHECK = "Check the instruments, then arm the bench again."
 _CATCH_UP_S, _WATCH_S = 0.2, 0.1
-_RECENT_S = 0.2  # since a thread last used the processor: longer, and it waits
+_RECENT_S = 0.5  # since a thread last used the processor: longer, and it waits
 _COMPUTES_S = 0.5  # without a block: the study computes and does not check whether it must end
 
 

@@ -34,7 +34,7 @@ class BenchState:
         events: the last ones, each with its time on the clock of the rig, in s.
         recorded: folder of the last study that was played to its end; empty: none.
         recording: folder of the study that is being played; empty: none.
-        requester: page whose arming request waits for the typed limit; empty: none.
+        requester: page that has requested to arm, and has not typed a limit yet; empty: none.
         computing: whether a simulated bench computes instead of reading blocks.
         extrapolated: whether the capacitance is outside the range in which the strain map was
             fitted, so that the band of the strain is not valid.

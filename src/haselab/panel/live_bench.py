@@ -296,14 +296,14 @@ class LiveBench:
         limits = self._rig.description.drive_limits
         if not _LEAST_V <= limit_v <= limits.high:
             raise LimitError(
-                f"The typed limit is {limit_v:g} V, but it must be {_LEAST_V:g} to "
-                f"{limits.high:g} V. Type another one."
+                f"The typed limit is {limit_v:g} V, but it must be at least "
+                f"{_LEAST_V:g} V and at most {limits.high:g} V. Type another one."
             )
         highest_v = 0.0 if job is None else job.highest_v(self._rig.description)
         if highest_v > limit_v:
             raise LimitError(
                 f"The study needs {up_to_millivolts(highest_v)} V, but the typed limit is "
-                f"{limit_v:g} V. Type this value, or change the study."
+                f"{limit_v:g} V. Type what it needs, or change the study."
             )
         self._request = None
         self._rig.safety.arm(request, str(values.get("acknowledged", "")))

@@ -42,9 +42,9 @@ def not_written(path: Path, error: OSError, what: str = "Cannot write") -> Devic
     Args:
         path: of the file or folder.
         error: of the system.
-        what: failed, as the start of the message.
+        what: what failed; the first words of the message.
     Returns:
-        To be raised.
+        The error, which the caller raises.
     """
     if error.errno in _BAD_PATH:
         remedy = "Part of the path is a file, a broken link, or too long: name another one."

@@ -204,7 +204,7 @@ def require_camera(file: RigFile, study: Study, path: Path) -> None:
     ]
     if filmed:
         raise InputError(
-            f"The study cannot be played: {', '.join(filmed)} measures the length with a camera, "
+            f"The study cannot be played: {', '.join(filmed)} need a camera to measure the length, "
             f"but the rig file has no section [camera]. Add one. {path}"
         )
 

@@ -65,7 +65,7 @@ def test_a_bench_without_a_camera_is_refused_before_it_is_armed(
         main([*command.split(), str(study), "--rig", str(rig), *out])
     assert stop.value.code == 2
     said = capsys.readouterr().err
-    assert "[triangle] measures the length with a camera" in said and "[camera]. Add one" in said
+    assert "[triangle] need a camera to measure the length" in said and "[camera]. Add one" in said
 
 
 def test_the_predicted_field_is_the_field_that_breaks_the_twin() -> None:

@@ -78,7 +78,7 @@ def test_a_study_of_steps_alone_is_played_with_the_maps_and_the_controller_of_th
     arguments = ("--rig", rig, "--keep-video", "none", "--out", out)
     assert run("run", known / "steps.toml", *arguments, "--actuator", leg) == 0
     said = capsys.readouterr().err
-    assert "Not played: steps.pi_trials = 1." in said and "no [chirp]" in said
+    assert "does not play steps.pi_trials = 1:" in said and "no [chirp]" in said
     rows = {r["id"]: r for r in json.loads((out / "results.json").read_text())["quantities"]}
     own = rows["S25.error_own"]
     # An integral leaves what creep moves within the step: the same bound as on the page.

@@ -68,7 +68,7 @@ def test_the_dialog_is_short_and_its_number_must_be_typed(page: Page) -> None:
     expect(limit_of(page)).to_have_value("")
     page.keyboard.press("Enter")
     expect(page.get_by_role("alert")).to_contain_text("This field is empty")
-    expect(form).to_contain_text("at most 2.000 V (10.00 kV), for example 1.")
+    expect(form).to_contain_text("smallest limit that you need, at most 2.000 V (10.00 kV).")
     form.get_by_text("All limits of this run").click()
     expect(form.get_by_text("up to 10 kV at the amplifier's output")).to_be_visible()
     limit_of(page).fill("1e-9")  # would be shown as 0.000 V

@@ -128,7 +128,7 @@ def test_a_frame_of_another_version_does_not_reload_the_page(
         page.goto(with_file.address)
         page.evaluate("window.sameDocument = true")
         expect(page.get_by_role("alert")).to_contain_text(
-            "another version of the panel. Reload it.", timeout=WAIT_MS
+            "another version. Reload this page.", timeout=WAIT_MS
         )
         page.wait_for_timeout(500)
         assert page.evaluate("window.sameDocument")

@@ -65,12 +65,12 @@ def test_the_planned_time_is_that_of_the_check(tmp_path: Path) -> None:
 def test_durations_and_choices_are_there_before_the_check(page: Page) -> None:
     page.get_by_role("button", name="Studies").click()
     expect(page.get_by_label("Static load (static_load): 20 min")).to_be_checked(timeout=WAIT_MS)
-    expect(page.get_by_text("Together about 57 min of bench time.")).to_be_visible()
+    expect(page.get_by_text("Planned duration of all: 57 min.")).to_be_visible()
     page.get_by_role("button", name="None").click()
     expect(page.get_by_role("checkbox", checked=True)).to_have_count(0)
     expect(page.get_by_role("button", name="Check, then play")).to_be_disabled()
     page.get_by_label("Maps (triangle)").check()
-    expect(page.get_by_text("Together about 20 s of bench time.")).to_be_visible()
+    expect(page.get_by_text("Planned duration of all: 20 s.")).to_be_visible()
     page.get_by_role("button", name="All", exact=True).click()
     page.get_by_label("Short version").check()
     expect(page.get_by_label("Static load (static_load): 13 min")).to_be_checked()
@@ -96,7 +96,7 @@ def test_a_limit_below_the_study_can_be_corrected_at_once(page: Page) -> None:
     page.get_by_role("button", name="Check, then play").click()
     page.get_by_role("button", name="Arm the bench and play").click()
     tab = page.locator(".tab")
-    expect(tab.get_by_text("Type at least 1.8, which this study needs")).to_be_visible()
+    expect(tab.get_by_text("This study needs at least 1.800 V (9.00 kV)")).to_be_visible()
     limit = limit_of(tab)
     limit.fill("1.5")
     limit.press("Enter")
@@ -114,7 +114,9 @@ def test_a_limit_below_the_study_can_be_corrected_at_once(page: Page) -> None:
 def test_what_the_list_of_recordings_says(page: Page, tmp_path: Path) -> None:
     page.get_by_role("button", name="Studies").click()
     row = page.get_by_role("row", name=re.compile("cut"))
-    expect(row).to_contain_text("needs complete experiments", timeout=WAIT_MS)
+    expect(row).to_contain_text(
+        "only if all of its recorded experiments are complete", timeout=WAIT_MS
+    )
     page.get_by_label("Search").fill("nothing like that")
     expect(page.get_by_text("No recording contains “nothing like that”")).to_be_visible()
     page.get_by_label("Search").fill("")

@@ -93,7 +93,7 @@ def test_the_rate_limit_multiplies_the_scatter_and_is_named(case: StepCase) -> N
     """The co-simulated chip scatters by 0.0075 to 0.0088 of the step, with these gains."""
     found = Scatter(0.008, predicted_scatter(case), predicted_scatter(case, math.inf), 20.0)
     assert 0.006 < found.predicted < 0.011
-    assert "faster changes of the drive than 20 V/s" in found.cause
+    assert "faster than its rate limit of 20 V/s" in found.cause
     assert "noise_gain" in found.cause
     gentle = replace(case.design.settings, kp=0.0, ki=2.0, kd=0.0)
     calm = replace(case, design=replace(case.design, settings=gentle))

@@ -34,9 +34,9 @@ _POINTS = (0.1, 0.5, 0.9)  # of the reachable range
 _SPREAD = ((1.1, 0.0, 2.5), (0.9, 0.5e-3, 2.5), (1.0, 5e-3, 6.0))
 _SHAKEN = 0.06  # of the highest drive, by noise
 _CHANGED, _MOVED = 1.0, 1.5
-# A large one makes the observer faster: a load is rejected better, but noise moves the drive more.
-# If that is too much, the design takes `SHAKE_M_S2`.
-_SHAKE_M_S2 = 0.04
+# Larger acceleration noise makes the observer faster: it rejects loads better, but passes more
+# noise to the drive. If that is too much, the design takes `SHAKE_M_S2`.
+_FAST_SHAKE_M_S2 = 0.04
 
 
 def feedback_gains(
@@ -134,9 +134,9 @@ def design_chip_observer(setting: ControllerSetting) -> Mapping[str, float]:
     higher, and with it 10 % lower and the delay 0.5 ms longer; at most 6 with the delay 5 ms
     longer, which is three times that of the loop. Noise moves the actuator by at most 1.5 times
     the noise of the sensed length, the drive by at most 6 % of its range and from one update to
-    the next by at most what the loop allows (standard deviations). The observer assumes unknown
-    accelerations of 0.04 m/s^2 per root of hertz, or 0.01 if noise moves the drive too much with
-    0.04.
+    the next by at most what the loop allows (standard deviations). The observer assumes
+    acceleration noise with a spectral density of 0.04 m/s^2/sqrt(Hz), or 0.01 if noise moves the
+    drive too much with 0.04.
 
     Args:
         setting: timing and limits of the loop, and the actuator.
@@ -154,7 +154,7 @@ def design_chip_observer(setting: ControllerSetting) -> Mapping[str, float]:
         for stiffness, later_s, peak in _SPREAD
     ]
     with contextlib.suppress(ResultError):
-        return _searched(motion, setting, points, _SHAKE_M_S2)
+        return _searched(motion, setting, points, _FAST_SHAKE_M_S2)
     return _searched(motion, setting, points, SHAKE_M_S2)
 
 

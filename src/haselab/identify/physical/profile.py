@@ -38,13 +38,13 @@ _FARTHER = 2.0  # times, in one round
 def extend_intervals(
     fit: ActuatorFit, misfit: Misfit, found: SearchResult, begun: Unknowns
 ) -> ActuatorFit:
-    """Extend the intervals of parameters of the law whose valley is curved.
+    """Extend the intervals of parameters for which the sum of squares is not quadratic.
 
     At each end, the misfit is first compared with a quadratic one, along the covariance. Only where
     it differs are the other parameters fitted again.
 
     Args:
-        fit: of the minimum.
+        fit: result at the minimum.
         misfit: that was minimised.
         found: its minimum.
         begun: where the user began.

@@ -109,9 +109,9 @@ def refine(
         start: first values.
         evaluations: of the model, made before.
         steps: at most.
-        begun: values that count as a weak observation, of the same names; None: `start`. A search
-            that goes on must keep those of its beginning. Otherwise, what the records hardly
-            determine moves on with each call.
+        begun: starting values that count as a weak observation, of the same names; None: `start`.
+            When a search continues, pass those of its first call; otherwise poorly determined
+            parameters drift with each call.
     Returns:
         The new result; None if no motion exists there.
     """

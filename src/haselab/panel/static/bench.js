@@ -26,8 +26,6 @@ export function othersDo(state, link) {
   const of = (page, what) => (page && page !== link.holder ? `${what} by ${page}` : "");
   return of(state?.holder, "armed") || of(state?.requester, "requested");
 }
-// A round number that is at most half of another one.
-const rounded = (v) => Number((Math.floor(v / 2 / 10 ** Math.floor(Math.log10(v / 2)) + 1e-9) * 10 ** Math.floor(Math.log10(v / 2))).toPrecision(1));
 // In V, not less than it.
 const millivolts = (v) => Number((Math.ceil(1000 * v - 1e-6) / 1000).toFixed(3));
 
@@ -85,7 +83,7 @@ export function Arming({ state, link, say, study = null, needs = 0, onArmed = ()
     say(found.error);
     link.ask("cancel");
   }
-  if (request === null) return html`${othersDo(state, link) && html`<p role="status">Another page has requested to arm the bench. Arming it here ends that request.</p>`}
+  if (request === null) return html`${othersDo(state, link) && html`<p role="status">Another page has requested to arm the bench. If you arm the bench here, that request is cancelled.</p>`}
     <button type="button" class="arm" ref=${first} onClick=${ask}>${study === null ? "Arm the bench …" : "Arm the bench and play …"}</button>`;
   const most = limitOf(state, state.high_v), least = millivolts(needs);
   return html`<form onSubmit=${arm}>
@@ -96,7 +94,7 @@ export function Arming({ state, link, say, study = null, needs = 0, onArmed = ()
     <label>Highest drive of this run, in V at the amplifier's input
       <input ...${typed.field} ref=${field} />
     </label>${typed.line}
-    <p>${needs > 0 ? html`Type at least <strong>${least}</strong>, which this study needs, and at most ${most}.` : html`Type at most ${most}, for example <strong>${rounded(state.high_v)}</strong>.`}</p>
+    <p>${needs > 0 ? html`This study needs at least <strong>${kilo(least, state.gain)}</strong>. At most: ${most}.` : `Type the smallest limit that you need, at most ${most}.`}</p>
     <div class="row"><button class="danger" type="submit" disabled=${sent || (request.reason && !known)}>${sent ? "Checking …" : study === null ? "Arm" : "Arm and play"}</button>
     <button type="button" onClick=${cancel}>Cancel</button></div>
     <details><summary>All limits of this run</summary><p>${request.limits}</p></details>

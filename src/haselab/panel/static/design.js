@@ -1,7 +1,7 @@
 // Margins, frequency response and step of the identified model, with gains to drag.
 import { html, useState, useEffect, useRef } from "/static/vendor/htm-preact.js";
 import { axisOf, colours, follow } from "/static/charts.js";
-import { Said } from "/static/bench.js";
+import { Said, focusLost } from "/static/bench.js";
 import { Range, useNumber } from "/static/number.js";
 import { unsaved } from "/static/requests.js";
 
@@ -161,7 +161,14 @@ export default function Design({ link, state }) {
   const put = (name) => (value) => { say({ text: "", bad: false }); change({ ...gains, [name]: value }); };
   const isShown = found !== null && !found.error;
   const isNew = isShown && (!about.is_pid || same(found.gains, gains));
-  const during = async (name, request) => { setBusy(name); const answer = await request(); setBusy(""); return answer; };
+  const during = async (name, request) => {
+    const pressed = document.activeElement; // a disabled button loses the focus
+    setBusy(name);
+    const answer = await request();
+    setBusy("");
+    setTimeout(() => { if (focusLost()) pressed?.focus({ preventScroll: true }); });
+    return answer;
+  };
 
   async function compute() {
     const answer = await during("compute", () => link.request("design-search"));
@@ -207,7 +214,7 @@ export default function Design({ link, state }) {
         ${gains !== null && html`<div class="row">
           <button type="button" disabled=${busy !== ""} onClick=${compute}>${busy === "compute" ? "Computing …" : "Compute gains"}</button>
           <button type="button" disabled=${busy !== ""} onClick=${reopen}>Read the file again</button>
-          <button type="button" disabled=${busy !== "" || !isShown} onClick=${write}>Write to the actuator file</button>
+          <button type="button" disabled=${busy !== "" || !isShown} onClick=${write}>${busy === "write" ? "Writing …" : "Write to the actuator file"}</button>
           ${unwritten !== null && html`<strong class="changed" role="status">Changed, not written</strong>`}</div>`}
         <${Said} error=${said.bad ? said.text : ""} done=${said.text} />
       </div>

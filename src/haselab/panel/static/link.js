@@ -92,7 +92,7 @@ export class Link extends Requests {
   framed(buffer) {
     const head = new DataView(buffer);
     if (head.getUint16(0, true) !== SCHEMA) { // no reload of its own: it would lose what is not saved
-      this.problem = "This page belongs to another version of the panel. Reload it.";
+      this.problem = "The panel was started again with another version. Reload this page.";
       this.socket.close();
       return;
     }

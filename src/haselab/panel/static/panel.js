@@ -221,7 +221,7 @@ function Panel() {
           <fieldset class="plain" disabled=${lost}>
           ${link.problem && html`<p class="error" role="alert">${link.problem}</p>`}
           <${Said} error=${error} />
-          ${state?.reason && html`<p class=${state.stage === "tripped" ? "error" : ""}>Last message of the bench: ${state.reason}${!live && state.drive_v === 0 ? " The drive is 0 V." : ""}</p>`}
+          ${state?.reason && html`<p class=${state.stage === "tripped" ? "error" : ""}>Last message of the bench: ${/[.!]$/.test(state.reason) ? state.reason : `${state.reason}.`}${!live && state.drive_v === 0 ? " The drive is 0 V." : ""}</p>`}
           ${state === null ? html`<p>No data from the bench process. If this does not change, read the messages in the terminal of haselab panel.</p>`
             : mine ? html`<${Live} state=${state} say=${say} />`
             : live ? html`<p class="badge live">Armed by another page up to ${limitOf(state)}</p>

@@ -381,7 +381,7 @@ function Picker({ link, isArmed }) {
     ${!list.only && html`<label>Video <select value=${video} disabled=${isArmed} onChange=${(e) => open(e.target.value)}>
       <option value="">Choose one of ${list.more ? "the first " : ""}${list.videos.length} below ${list.folder}</option>
       ${list.videos.map((name) => html`<option value=${name}>${name}</option>`)}</select></label>
-      ${isArmed && html`<p role="status">The bench is armed, so the list of videos cannot be opened: it would take the key of STOP. Disarm the bench first.</p>`}`}
+      ${isArmed && html`<p role="status">While the bench is armed, the list of videos is disabled, because Esc would close the list instead of pressing STOP. Disarm the bench first.</p>`}`}
     ${!list.only && !list.videos.length && html`<p>There is no video below ${list.folder}. Start haselab panel with --runs DIR, or use haselab track --pick VIDEO.</p>`}
     ${picture === null ? message : html`<div class="layout pick">
       <section aria-label="Picture">

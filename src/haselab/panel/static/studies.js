@@ -46,7 +46,7 @@ function Chooser({ link, state, mine, onEnd }) {
   if (busy && state.mode === "study") return html`<div class="card warning"><h2>Study</h2>
     <p class="badge live">Another page plays a study, up to ${limitOf(state)}</p><${Progress} state=${state} /></div>`;
   if (list === null) return html`<div class="card"><h2>Study</h2><p class=${error ? "error" : ""} role="status">${error || "Reading the studies …"}</p></div>`;
-  const blocked = busy && html`<div class="row" role="status"><span>${mine ? "This page has armed the bench. Disarm it before you play a study." : "The bench is armed by another page. Disarm it there before you play a study."} The list of studies cannot be opened meanwhile: it would take the key of STOP.</span>${mine && html`<button type="button" onClick=${disarm}>Disarm</button>`}</div>`;
+  const blocked = busy && html`<div class="row" role="status"><span>${mine ? "This page has armed the bench. Disarm it before you play a study." : "The bench is armed by another page. Disarm it there before you play a study."} Until then the list of studies is disabled, because Esc would close the list instead of pressing STOP.</span>${mine && html`<button type="button" onClick=${disarm}>Disarm</button>`}</div>`;
   const titles = list.find((one) => one.name === chosen.study)?.experiments ?? [];
   const toggle = (table, on) => change({ experiments: titles.map((one) => one.table).filter((one) => (one === table ? on : chosen.experiments.includes(one))) });
   // Planned on the clock of the bench; a file that cannot be planned has none.
@@ -66,13 +66,13 @@ function Chooser({ link, state, mine, onEnd }) {
         onChange=${(e) => toggle(one.table, e.target.checked)} /> ${one.title} (${one.table})${typeof one.seconds[Number(chosen.quick)] === "number" ? `: ${when(one.seconds[Number(chosen.quick)])}` : ""}</label>`)}</fieldset>
     <label><input type="checkbox" checked=${chosen.quick} onChange=${(e) => change({ quick: e.target.checked })} /> Short version</label>
     <label><input type="checkbox" checked=${chosen.keep_video === "none"} onChange=${(e) => change({ keep_video: e.target.checked ? "none" : "sample" })} /> Keep no camera frames</label>
-    ${seconds.length > 0 && total !== null && html`<p>Together about ${when(total)} of bench time.${fast}</p>`}
+    ${seconds.length > 0 && total !== null && html`<p>Planned duration of all: ${when(total)}.${fast}</p>`}
     <div class="row"><button type="button" ref=${place} disabled=${checked === "checking" || chosen.experiments.length === 0} onClick=${check}>Check, then play …</button>
       ${chosen.experiments.length === 0 && html`<span>Tick an experiment first.</span>`}</div>
     ${checked === "checking" && html`<p role="status">Checking the study against the limits of the bench …</p>`}
     ${checked !== null && checked !== "checking" && html`
       <p role="status">${!checked.rated ? "The rating of this bench is not known (the rig file has no [rating]), so the study was not checked against it."
-        : checked.ok ? `The bench can play this study. It takes ${when(checked.seconds)} of bench time. Its highest drive is ${kilo(checked.highest_v, state?.gain ?? 1)}.` : "The bench cannot play this study."}</p>
+        : checked.ok ? `The bench can play this study. Its planned duration is ${checked.seconds === null ? "not known" : when(checked.seconds)}. Its highest drive is ${kilo(checked.highest_v, state?.gain ?? 1)}.` : "The bench cannot play this study."}</p>
       ${checked.ok && busy && html`<p>The bench is armed: disarm it first, see above.</p>`}
       ${checked.ok && !busy && state && html`<${Arming} state=${state} link=${link} say=${say} study=${{ ...chosen, sha256: checked.sha256 }} needs=${checked.highest_v ?? 0} onArmed=${() => setChecked(null)} />`}
       ${checked.checks.length > 0 && html`<table class="wide"><thead><tr><th scope="col">Check</th><th scope="col">Where</th><th scope="col">Needed</th><th scope="col">Limit</th><th scope="col">What to do</th></tr></thead>
@@ -214,8 +214,8 @@ function Recordings({ link, mode, recording }) {
       <td data-label="Note"><${Note} name=${one.name} saved=${one.note} keep=${keep} /></td>
       <td data-label="Results"><div class="row">${one.report ? html`<button type="button" onClick=${() => open(one.name)}>Report</button>` : ""}
         <button type="button" disabled=${one.analysing || one.open} onClick=${() => analyse(one.name)}>${one.analysing ? "Analysing …" : "Analyse"}</button></div>
-        ${one.open && one.name !== recording && html`<p>It can be analysed after haselab recover.</p>`}
-        ${one.state && !one.open && !one.report && !one.problem && !/^(complete|recovered)/.test(one.state) && html`<p>It ended early. The analysis needs complete experiments, so it is refused if one was cut short.</p>`}
+        ${one.open && one.name !== recording && html`<p>Run haselab recover on its folder before you analyse it.</p>`}
+        ${one.state && !one.open && !one.report && !one.problem && !/^(complete|recovered)/.test(one.state) && html`<p>This study ended early. It can be analysed only if all of its recorded experiments are complete.</p>`}
         ${one.problem && html`<p class="error">${one.problem}</p>`}</td></tr>`)}</tbody></table>
     ${all.length === 0 && wanted.length > 0 && html`<p role="status">No recording contains “${search.trim()}” in its name, study, date, end or note.</p>`}
     ${all.length > most && html`<p>The newest ${most} of ${all.length} are shown.</p><button type="button" onClick=${() => setMost(most + MOST_ROWS)}>Show more</button>`}</div>`;

@@ -82,9 +82,9 @@ def unplayed_trials(study: Study) -> str:
     if not asked:
         return ""
     return (
-        f"Not played: {' and '.join(asked)}. This controller is designed from a chirp, and the "
-        f"study has no {' and no '.join(missing)}. To play the controller of the actuator file or "
-        "one named in [control], set steps.custom_trials."
+        f"The study does not play {' and '.join(asked)}: PI and PID are designed from [chirp] and "
+        f"[control], and it has no {' and no '.join(missing)}. Add what is missing, or set "
+        "steps.custom_trials to play the controller of the actuator file."
     )
 
 

@@ -50,10 +50,10 @@ class Scatter:
         if self.predicted < _LIMITING * self.linear:
             return ""
         return (
-            f"Noise asks for faster changes of the drive than {self.rise_v_per_s:g} V/s. This "
-            f"limit increases the scatter of the strain at rest from {100.0 * self.linear:.2g} to "
-            f"{100.0 * self.predicted:.2g} % of the step. Design with a smaller noise_gain in "
-            "[controller.demands] to avoid this."
+            f"Noise changes the drive faster than its rate limit of {self.rise_v_per_s:g} V/s. "
+            "This increases the standard deviation of the strain before the step from "
+            f"{100.0 * self.linear:.2g} to {100.0 * self.predicted:.2g} % of the step. Design "
+            "with a smaller noise_gain in [controller.demands]."
         )
 
 

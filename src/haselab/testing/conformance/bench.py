@@ -255,4 +255,6 @@ class DaqConformance(InstrumentConformance):
                 assert np.abs(drive_v(rig, 2)[-1]).max() < _SHARE
             except DeviceError as error:
                 if output_v is None:
-                    pytest.skip(f"without a fixture output_v, 0 V cannot be seen: {error}")
+                    pytest.skip(
+                        f"the device is lost, so only a fixture output_v can confirm 0 V: {error}"
+                    )

@@ -280,11 +280,14 @@ def test_axe_finds_nothing(browser: Browser, shared_panel: RunningPanel, scheme:
         page.set_default_timeout(WAIT_MS)
         page.goto(shared_panel.address)
         expect(page.locator("#age")).to_have_text("data live", timeout=WAIT_MS)
-        page.get_by_role("button", name="Arm the bench").click()
-        expect(page.get_by_label("Highest drive of this run")).to_be_visible(timeout=WAIT_MS)
+        for end in ("Cancel", ""):
+            page.get_by_role("button", name="Arm the bench").click()
+            expect(page.get_by_label("Highest drive of this run")).to_be_visible(timeout=WAIT_MS)
+            if end:
+                page.get_by_role("button", name=end).click()
+        # On a busy computer, axe keeps the page silent for so long that the dialog may close.
         found = Axe().run(page)
         assert found.violations_count == 0, found.generate_report()
-        page.get_by_role("button", name="Cancel").click()
         for name, content in PAGES.items():
             page.get_by_role("button", name=name, exact=True).click()
             expect(page.get_by_text(content).first).to_be_visible(timeout=WAIT_MS)

@@ -15,6 +15,17 @@ from typing import Any
 import websockets
 
 # How long a test may hang: a busy machine must not fail it.
+TRIANGLE = """
+name = "one triangle"
+
+[triangle]
+low_v = 0.0
+high_v = 1.8
+frequency_hz = 0.5
+cycles = 4
+skipped_cycles = 1
+frame_rate_hz = 200.0
+"""
 WAIT_S = float(os.environ.get("HASELAB_PANEL_WAIT_S", "300"))
 
 

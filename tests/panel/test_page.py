@@ -13,19 +13,7 @@ import pytest
 from axe_playwright_python.sync_playwright import Axe
 from playwright.sync_api import Browser, BrowserContext, Page, expect
 
-from tests.panel.running import WAIT_S, RunningPanel, ended, started
-
-TRIANGLE = """
-name = "one triangle"
-
-[triangle]
-low_v = 0.0
-high_v = 1.8
-frequency_hz = 0.5
-cycles = 4
-skipped_cycles = 1
-frame_rate_hz = 200.0
-"""
+from tests.panel.running import TRIANGLE, WAIT_S, RunningPanel, ended, started
 
 STATIC = Path(__file__).parents[2] / "src" / "haselab" / "panel" / "static"
 RIGS = Path(__file__).parents[2] / "rigs"

@@ -24,19 +24,16 @@ from haselab.panel.pages.recordings import analyse, compare, listed, note, repor
 from haselab.panel.pages.study_job import StudyJob, available, check, chosen_study
 from haselab.rig.rig_file import load_rig
 from haselab.store.session.reader import SessionReader
-from tests.panel.running import WAIT_S, Page, RunningPanel, connected, ended, started
+from tests.panel.running import (
+    TRIANGLE,
+    WAIT_S,
+    Page,
+    RunningPanel,
+    connected,
+    ended,
+    started,
+)
 
-TRIANGLE = """
-name = "one triangle"
-
-[triangle]
-low_v = 0.0
-high_v = 1.8
-frequency_hz = 0.5
-cycles = 4
-skipped_cycles = 1
-frame_rate_hz = 200.0
-"""
 STUDY = {"study": "triangle.toml", "keep_video": "none"}
 LONG = {"study": "reference study", "experiments": ["triangle", "static_load"]}
 

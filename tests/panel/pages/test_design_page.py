@@ -9,26 +9,10 @@ import pytest
 from axe_playwright_python.sync_playwright import Axe
 from playwright.sync_api import Browser, Page, Request, expect
 
-from tests.panel.pages.test_design import CONTROLLER, GAINS, MODEL, ask
+from tests.panel.pages.test_design import GAINS, MODEL, ask
 from tests.panel.running import WAIT_S, RunningPanel, ended, started
 
 WAIT_MS = 1e3 * WAIT_S
-
-
-@pytest.fixture
-def path(tmp_path: Path) -> Path:
-    found = tmp_path / "actuator.toml"
-    found.write_text(MODEL + CONTROLLER)
-    return found
-
-
-@pytest.fixture
-def with_file(path: Path) -> Iterator[RunningPanel]:
-    found = started("--actuator", str(path))
-    try:
-        yield found
-    finally:
-        ended(found)
 
 
 @pytest.fixture

@@ -7,8 +7,7 @@ from pathlib import Path
 import pytest
 from playwright.sync_api import Browser, Page, expect
 
-from tests.panel.pages.test_design import CONTROLLER, MODEL
-from tests.panel.running import WAIT_S, RunningPanel, ended, started
+from tests.panel.running import WAIT_S, RunningPanel
 
 WAIT_MS = 1e3 * WAIT_S
 FIRST_DARK = [0x6F, 0xB1, 0xFF]  # --first of panel.css
@@ -21,22 +20,6 @@ PIXELS = """(colour) => [...document.querySelectorAll("canvas")].filter((one) =>
         }
         return found;
     })"""
-
-
-@pytest.fixture
-def path(tmp_path: Path) -> Path:
-    found = tmp_path / "actuator.toml"
-    found.write_text(MODEL + CONTROLLER)
-    return found
-
-
-@pytest.fixture
-def with_file(path: Path) -> Iterator[RunningPanel]:
-    found = started("--actuator", str(path))
-    try:
-        yield found
-    finally:
-        ended(found)
 
 
 @pytest.fixture

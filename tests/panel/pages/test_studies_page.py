@@ -10,20 +10,9 @@ from playwright.sync_api import Browser, Page, expect
 from haselab.panel.files import PanelFiles
 from haselab.panel.pages.study_job import available, check
 from tests.panel.pages.test_arming_page import arm, limit_of, opened
-from tests.panel.running import WAIT_S, RunningPanel, ended, started
+from tests.panel.running import TRIANGLE, WAIT_S, RunningPanel, ended, started
 
 WAIT_MS = 1e3 * WAIT_S
-TRIANGLE = """
-name = "one triangle"
-
-[triangle]
-low_v = 0.0
-high_v = 1.8
-frequency_hz = 0.5
-cycles = 4
-skipped_cycles = 1
-frame_rate_hz = 200.0
-"""
 
 
 @pytest.fixture
